@@ -22,7 +22,7 @@ from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.field.field import RadianceField
+from pipeline.field.field import FieldColours, RadianceField
 from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.geometry.camera import pixel_footprint_m
@@ -146,7 +146,7 @@ def run(
         body=body,
         train=train,
         validation=validation,
-        shader=FieldColourShader(field),
+        shader=FieldColours(field),
         target_edge_m=target_edge_m,
         rounds=config.rounds,
         steps=config.steps,
@@ -220,18 +220,6 @@ def finish_mesh(mesh: Mesh, inputs: RefinementInputs, face_limit: int) -> Mesh:
 
     parts = faces_by_part(mesh, inputs.body)
     return resolve_self_intersections(reduce_faces(mesh, parts, psnr_db, inputs.settings, face_limit))
-
-
-class FieldColourShader(torch.nn.Module):
-    """The colours of the field; their parameters are optimised together with the mesh."""
-
-    def __init__(self, field: torch.nn.Module) -> None:
-        super().__init__()
-        self.field = field
-
-    def forward(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return colours in [0, 1] at canonical points."""
-        return self.field(points_m)[0]
 
 
 def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config) -> float:
@@ -344,7 +332,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=40,
+    version=41,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -150,6 +150,20 @@ class RadianceField(torch.nn.Module):
             return torch.cat([self(chunk)[0] for chunk in x_canonical_m.split(QUERY_CHUNK_POINTS)])
 
 
+class FieldColours(torch.nn.Module):
+    """The colours of a field, to be optimised together with a surface."""
+
+    def __init__(self, field: RadianceField) -> None:
+        super().__init__()
+        self.field = field
+
+    def forward(
+        self, points_m: Float[Tensor, "n 3"], feature_gradients: FeatureGradients | None = None
+    ) -> Float[Tensor, "n 3"]:
+        """Return colours in [0, 1] at canonical points; feature_gradients: see `pipeline.kernels.hashgrid.encode`."""
+        return self.field.radiance(points_m, feature_gradients)[0]
+
+
 def _uniform(shape: tuple[int, int], limit: float, rng: torch.Generator) -> torch.nn.Parameter:
     return torch.nn.Parameter((2 * torch.rand(shape, generator=rng) - 1) * limit)
 

@@ -48,6 +48,11 @@ class Camera:
         """Return the camera of a crop of the image with the upper left corner (left_px, top_px)."""
         return replace(self, cx=self.cx - left_px, cy=self.cy - top_px, width=width_px, height=height_px)
 
+    @property
+    def intrinsics_px(self) -> tuple[float, float, float, float]:
+        """Focal lengths and principal point (fx, fy, cx, cy), px."""
+        return self.fx, self.fy, self.cx, self.cy
+
     def centre_m(self) -> Float[np.ndarray, "3"]:
         """Return the position of the camera centre in the world, m."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]

@@ -34,7 +34,7 @@ def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
     left, right = order[first], order[first + 1]
     neighbour = torch.full((len(edges),), -1, dtype=torch.int64, device=faces.device)
     neighbour[left], neighbour[right] = right // 3, left // 3
-    return neighbour.view(-1, 3)
+    return neighbour.view(-1, 3).to(torch.int32)
 
 
 def render_shaded(
@@ -62,11 +62,9 @@ def render_shaded(
         The image premultiplied by alpha, alpha in [0, 1], and the face index of each pixel (-1 for none). The image
         composited on white is `image + 1 - alpha`.
     """
-    pixels = render_pixels(vertices_world, faces, camera, attributes, shader, adjacency)
-    shape = (camera.height, camera.width)
-    image = torch.zeros(camera.height * camera.width, pixels.values.shape[1]).to(pixels.values)
-    image = image.index_copy(0, pixels.pixel, pixels.values).view(*shape, -1)
-    return image[..., :-1], image[..., -1], pixels.face_id
+    adjacency = face_adjacency(faces) if adjacency is None else adjacency
+    size = camera.height, camera.width
+    return render_pixels(*project(vertices_world, camera), (faces, adjacency), size, attributes, shader).image()
 
 
 class RenderedPixels(NamedTuple):
@@ -82,24 +80,35 @@ class RenderedPixels(NamedTuple):
     face_id: Int[Tensor, "h w"]
     depth_m: Float[Tensor, "h w"]
 
+    def image(self) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+        """Return the image premultiplied by alpha, alpha, and the face index of each pixel, as `render_shaded`."""
+        blank = torch.zeros(self.face_id.numel(), self.values.shape[1]).to(self.values)
+        image = blank.index_copy(0, self.pixel, self.values).view(*self.face_id.shape, -1)
+        return image[..., :-1], image[..., -1], self.face_id
+
 
 def render_pixels(
-    vertices_world: Float[Tensor, "v 3"],
-    faces: Int[Tensor, "f 3"],
-    camera: Camera,
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    topology: tuple[Int[Tensor, "f 3"], Int[Tensor, "f 3"]],
+    size: tuple[int, int],
     attributes: Float[Tensor, "v c"],
     shader: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
-    adjacency: Int[Tensor, "f 3"] | None = None,
     wanted: Bool[Tensor, "h w"] | None = None,
 ) -> RenderedPixels:
     """Do `render_shaded` at the silhouettes, and at those other covered pixels that are wanted (default: all).
 
     Of a closed mesh, whose faces are counter-clockwise seen from outside, only those that face the camera are drawn.
+
+    Args:
+        vertices_px, depth_m: projected vertices, from `project` or `project_skinned`.
+        topology: corners of each face, and `face_adjacency` of them.
+        size: height and width of the image.
+        attributes, shader: as for `render_shaded`.
+        wanted: pixels to draw.
     """
-    vertices_px, depth_m = project(vertices_world, camera)
-    adjacency = face_adjacency(faces) if adjacency is None else adjacency
-    is_closed = bool((adjacency >= 0).all())
-    size = camera.height, camera.width
+    faces, adjacency = topology
+    is_closed = len(faces) > 0 and int(adjacency.min()) >= 0
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, *size, cull_backfaces=is_closed)
     blends = silhouette_blends(face_id, depth, vertices_px, depth_m, faces, adjacency)
     flat_face_id = face_id.reshape(-1)
@@ -110,7 +119,7 @@ def render_pixels(
     covered = torch.nonzero(is_covered[pixel]).squeeze(1)
     covered_pixel = pixel[covered]
     shaded = shader(
-        interpolate(covered_pixel, flat_face_id[covered_pixel], camera.width, vertices_px, depth_m, faces, attributes)
+        interpolate(covered_pixel, flat_face_id[covered_pixel], size[1], vertices_px, depth_m, faces, attributes)
     )
     with_alpha = torch.cat([shaded, shaded.new_ones(len(shaded), 1)], dim=1)
     values = torch.zeros(len(pixel), with_alpha.shape[1]).to(with_alpha).index_copy(0, covered, with_alpha)

@@ -16,6 +16,7 @@ from numba.types import uint8 as U1
 
 from pipeline.kernels import pixel_sampling
 from pipeline.kernels.adam import cpu as adam
+from pipeline.kernels.cholesky_solve import cpu as cholesky_solve
 from pipeline.kernels.hashgrid import cpu as hashgrid
 from pipeline.kernels.interpolate import cpu as interpolate
 from pipeline.kernels.inverse_skinning import cell_skinning_cpu, newton_cpu
@@ -26,6 +27,7 @@ from pipeline.kernels.pixel_sampling import cpu as pixel_sampling_cpu
 from pipeline.kernels.raster import cpu as raster
 from pipeline.kernels.raster import silhouette_cpu
 from pipeline.kernels.ray_losses import cpu as ray_losses
+from pipeline.kernels.skinned_projection import cpu as skinned_projection
 from pipeline.kernels.texel_projection import cpu as texel_projection
 from pipeline.kernels.texture_sampling import cpu as texture_sampling
 from pipeline.kernels.transmittance_stats import cpu as transmittance_stats
@@ -81,6 +83,8 @@ BUFFERS = named_tuple(
 OUTPUT_GRADIENTS = named_tuple(backward_cpu.OutputGradientArrays, F4_2D, F4_1D, F4_1D)
 PARAMETER_GRADIENTS = named_tuple(backward_cpu.ParameterGradients, F4_2D, F4_2D, F4_1D, F4_3D, F4_3D)
 
+SKIN_WEIGHTS = named_tuple(skinned_projection.SkinArrays, I8_1D, I8_1D, F4_1D, F4_2D)
+
 MESH = named_tuple(texel_projection.MeshArrays, F4_2D, F4_1D, F4_1D, I4_2D)
 TEXEL_SUMS = types.Tuple((F4_2D, F4_1D))
 VIEW = named_tuple(texel_projection.ViewArrays, F4_3D, F4_2D, F4_2D)
@@ -108,11 +112,14 @@ SIGNATURES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     (inverse_skinning.skin_nodes, (F4_2D, F4_3D)),
     (inverse_skinning.bake_warp_grid, (F4_2D, SKIN, POSED_GRID)),
     # mesh
-    (raster.silhouette_edges_cpu, (F4_2D, I8_2D, I8_2D)),
+    (skinned_projection.project_skinned_backward, (F4_2D, F4_2D, F4_1D, SKIN_WEIGHTS, types.UniTuple(F8, 4))),
+    (skinned_projection.project_skinned, (F4_2D, SKIN_WEIGHTS, types.UniTuple(F8, 4))),
+    (cholesky_solve.cholesky_solve, (I8_1D, I4_1D, F4_1D, F4_1D, I8_1D, F4_2D)),
+    (raster.silhouette_edges_cpu, (F4_2D, I4_2D, I4_2D)),
     (silhouette_cpu.add_fraction_gradient, (I8_2D, F4_2D, F4_1D, I8)),
     (silhouette_cpu.silhouette_blends_cpu, (I4_2D, F4_2D, F4_2D, F4_1D, I8_2D)),
-    (interpolate.interpolate_backward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I8_2D, F4_2D, F4_2D)),
-    (interpolate.interpolate_forward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I8_2D, F4_2D)),
+    (interpolate.interpolate_backward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I4_2D, F4_2D, F4_2D)),
+    (interpolate.interpolate_forward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I4_2D, F4_2D)),
     (hashgrid.find_nonzero_rows, (F4_2D,)),
     (hashgrid.add_points_gradient, (F4_2D, HASH_TABLE, FEATURES, F4_2D, F4_2D)),
     (hashgrid.encode, (F4_2D, HASH_TABLE, FEATURES, F4_2D)),

@@ -165,7 +165,8 @@ def gather_evidence(surface: AlignedSurface, subtree_weights: Float[Tensor, "v k
     camera, shape = view.camera, (view.camera.height, view.camera.width)
     skin, shader = surface.skin, surface.shader or (lambda attributes: attributes)
     posed = view.pose_vertices(surface.vertices, skin.weights)
-    drawn = render_pixels(posed, skin.faces, camera, surface.attributes(posed), shader, skin.adjacency)
+    projected, topology = project(posed, camera), (skin.faces, skin.adjacency)
+    drawn = render_pixels(*projected, topology, shape, surface.attributes(posed), shader)
     render = np.zeros((drawn.values.shape[1], camera.height * camera.width), np.float32)
     render[:, drawn.pixel.numpy()] = drawn.values.numpy().T
     render = render.reshape(-1, *shape)
@@ -188,7 +189,7 @@ def gather_evidence(surface: AlignedSurface, subtree_weights: Float[Tensor, "v k
     seen = covered[torch.from_numpy(nearest_point[PIXELS][used])]
     attributes = torch.cat([posed, subtree_weights], dim=1)
     at_pixel = seen, drawn.face_id.reshape(-1)[seen], camera.width
-    points = interpolate(*at_pixel, *project(posed, camera), skin.faces, attributes).numpy()
+    points = interpolate(*at_pixel, *projected, skin.faces, attributes).numpy()
     return ImageEvidence(points[:, :3], points[:, 3:], structure, np.stack([pull_x, pull_y], axis=-1))
 
 

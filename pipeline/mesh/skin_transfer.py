@@ -4,6 +4,7 @@ Reference: Abdrashitov et al., "Robust Skin Weights Transfer via Weight Inpainti
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from pipeline.geometry.differentiable_raster import face_adjacency
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh, laplacian
+from pipeline.kernels.blend import SparseWeights
 
 MIN_NORMAL_COSINE = 0.5
 """Smallest cosine between the normals of a vertex and of its closest point on the body: 60 degrees."""
@@ -26,11 +28,19 @@ WEIGHT_SMOOTHING_STEP = 0.5
 
 @dataclass(frozen=True)
 class SkinnedTopology:
-    """Faces, face adjacency and skin weights of a mesh, which stay fixed while its vertices are optimised."""
+    """Faces, face adjacency and skin weights of a mesh, which stay fixed while its vertices are optimised.
+
+    faces, adjacency: int32, as the kernels read them.
+    """
 
     faces: Int[Tensor, "f 3"]
     adjacency: Int[Tensor, "f 3"]
     weights: Float[Tensor, "v j"]
+
+    @cached_property
+    def sparse_weights(self) -> SparseWeights:
+        """The weights without their zeros."""
+        return SparseWeights.from_dense(self.weights)
 
 
 def transfer_skin(mesh: Mesh, body: Body) -> SkinnedTopology:
@@ -42,7 +52,7 @@ def transfer_skin(mesh: Mesh, body: Body) -> SkinnedTopology:
 
 def build_skinned_topology(mesh: Mesh, weights: Float[Tensor, "v j"]) -> SkinnedTopology:
     """Build the topology of a mesh with known skin weights."""
-    faces = torch.from_numpy(mesh.faces.astype(np.int64))
+    faces = torch.from_numpy(mesh.faces.astype(np.int32))
     return SkinnedTopology(faces, face_adjacency(faces), weights)
 
 

@@ -9,26 +9,29 @@ that each step moves neighbouring vertices together (Nicolet et al., "Large Step
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import partial, reduce
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.sparse import csr_array, diags_array, eye_array
-from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.core.progress import track
+from pipeline.field.field import FieldColours
 from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, laplacian
 from pipeline.kernels.adam import adam_step_
+from pipeline.kernels.cholesky_solve import CholeskyFactors, cholesky_solve
 from pipeline.kernels.common.thread_pool import ThreadPool, shared_thread_pool
+from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.mesh.remeshing import face_of_person
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
-from pipeline.mesh.views import PosedView, sampled_losses
+from pipeline.mesh.views import PosedView, Shader, sampled_losses
 
 MAX_EDGE_WEIGHT = 16.0
 """Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
@@ -61,13 +64,7 @@ class RefinementInputs:
     settings: MeshSettings = field(default_factory=MeshSettings)
 
 
-def smooth(factorisation: SuperLU, differential_coordinates: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
-    """Return D = (I + lambda L)^-1 u of u."""
-    solution = factorisation.solve(differential_coordinates.double().numpy())
-    return torch.from_numpy(solution).to(differential_coordinates)
-
-
-def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothing_lambda: float) -> SuperLU:
+def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothing_lambda: float) -> CholeskyFactors:
     """Factorise I + lambda L with the combinatorial Laplacian L = degree - adjacency.
 
     An edge has the weight (median length / length)^2, at most `MAX_EDGE_WEIGHT`, so that the smoothing reaches equally
@@ -81,7 +78,8 @@ def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothi
     weight[stiff_vertex[ends].all(axis=1)] *= STIFFNESS
     weighted = adjacency(mesh, weight)
     combinatorial = diags_array(np.asarray(weighted.sum(axis=1)).ravel()) - weighted
-    return factorise_positive_definite(eye_array(count) + smoothing_lambda * combinatorial)
+    matrix = eye_array(count) + smoothing_lambda * combinatorial
+    return CholeskyFactors.from_superlu(factorise_positive_definite(matrix))
 
 
 def optimise_vertices(
@@ -103,66 +101,112 @@ def optimise_vertices(
     generator = torch.Generator().manual_seed(seed)
     start = torch.from_numpy(mesh.vertices.astype(np.float32))
     stiff = face_of_person(mesh, inputs.body)
-    factorisation = factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda)
+    factors = factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda)
     operator = csr_array(laplacian(mesh)).astype(np.float32)
     squared_laplacian = csr_array(operator.T @ operator)
     coordinates, global_offset = torch.zeros_like(start), torch.zeros(3)
     learning_rates = [settings.learning_rate * (1.0 + settings.smoothing_lambda), settings.global_learning_rate]
     offset_optimiser = AdamUniform([coordinates, global_offset], learning_rates)
-    colours: list[Tensor] = [parameter for parameter in inputs.shader.parameters() if parameter.requires_grad]
-    colour_rate = settings.appearance_learning_rate
-    moments = [(torch.zeros_like(colour), torch.zeros_like(colour)) for colour in colours]
-    warm_up = settings.appearance_steps if colours else 0
+    colour_optimiser = ColourOptimiser(inputs.shader, settings.appearance_learning_rate)
+    warm_up = settings.appearance_steps if colour_optimiser.leaves else 0
     threads = shared_thread_pool(settings.frames_per_step)
     for step in track(range(warm_up + inputs.steps), label):
-        update_vertices = step >= warm_up
-        offset = smooth(factorisation, coordinates)
-        vertices = (start + offset + global_offset).requires_grad_(update_vertices)
-        view_gradients = _batch_gradients(vertices, colours, skin, inputs, generator, threads)
+        offset = cholesky_solve(factors, coordinates)
+        vertices = (start + offset + global_offset).requires_grad_(step >= warm_up)
+        gradients = _batch_gradients(vertices, colour_optimiser, skin, inputs, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + inputs.steps)))
-        if update_vertices:
+        if gradients.vertices is not None:
             of_offset, of_global = regularisation_gradients(offset, global_offset, squared_laplacian, inputs)
-            of_vertices = view_gradients[0]
             # (I + lambda L) is symmetric, so that the gradient of u is smoothed like u itself.
-            gradients = smooth(factorisation, of_offset + of_vertices), of_global + of_vertices.sum(0)
-            offset_optimiser.step(gradients, decay)
-        of_colours = view_gradients[len(view_gradients) - len(colours) :]
-        for colour, gradient, moment in zip(colours, of_colours, moments, strict=True):
-            adam_step_(colour, gradient, *moment, step + 1, colour_rate * decay, epsilon=1e-12)
-    moved = start + smooth(factorisation, coordinates) + global_offset
+            of_coordinates = cholesky_solve(factors, of_offset + gradients.vertices)
+            offset_optimiser.step((of_coordinates, of_global + gradients.vertices.sum(0)), decay)
+        colour_optimiser.step(gradients, decay)
+    moved = start + cholesky_solve(factors, coordinates) + global_offset
     return Mesh(moved.numpy(), mesh.faces)
+
+
+class BatchGradients(NamedTuple):
+    """Gradients of the mean loss of some views.
+
+    vertices: None if they are not optimised, or not seen. colours: of `ColourOptimiser.leaves`; None where autograd has none.
+    features: of the hash grid, in the order of the views.
+    """
+
+    vertices: Float[Tensor, "v 3"] | None
+    colours: Sequence[Tensor | None]
+    features: FeatureGradients
+
+
+class ColourOptimiser:
+    """Adam on those parameters of a shader that require a gradient, `leaves`.
+
+    Autograd would allocate, clear and add up a gradient of the whole hash table for each view; it is added up outside
+    of autograd, once for all views of a step.
+    """
+
+    def __init__(self, shader: torch.nn.Module, learning_rate: float) -> None:
+        self._shader, self._learning_rate, self._count = shader, learning_rate, 0
+        self._field = shader.field if isinstance(shader, FieldColours) and shader.field.table.requires_grad else None
+        self.leaves = [parameter for parameter in shader.parameters() if parameter.requires_grad]
+        self._moments = [(torch.zeros_like(leaf), torch.zeros_like(leaf)) for leaf in self.leaves]
+        self._grad_table = torch.zeros_like(self._field.table) if self._field else torch.zeros(0)
+
+    def shader(self, feature_gradients: FeatureGradients) -> Shader:
+        """Return the shader of one view; its backward pass appends the gradients of the features to the list."""
+        return partial(self._shader, feature_gradients=feature_gradients) if self._field else self._shader
+
+    def step(self, gradients: BatchGradients, learning_rate_scale: float) -> None:
+        """Update the parameters with the learning rate times `learning_rate_scale`."""
+        self._count += 1
+        rate = self._learning_rate * learning_rate_scale
+        for leaf, gradient, moments in zip(self.leaves, gradients.colours, self._moments, strict=True):
+            if self._field and leaf is self._field.table:
+                add_table_gradient_(self._grad_table, gradients.features, self._field.layout)
+                gradient = self._grad_table
+            elif gradient is None:
+                # No view has a covered pixel.
+                gradient = torch.zeros_like(leaf)
+            adam_step_(leaf, gradient, *moments, self._count, rate, epsilon=1e-12)
 
 
 def _batch_gradients(
     vertices: Float[Tensor, "v 3"],
-    colours: Sequence[Tensor],
+    colours: ColourOptimiser,
     skin: SkinnedTopology,
     inputs: RefinementInputs,
     generator: torch.Generator,
     threads: ThreadPool,
-) -> list[Tensor]:
+) -> BatchGradients:
     """Return the gradients of the mean loss of a batch of random training views on random backgrounds.
 
-    The gradients are those of the vertices, if these require one, and of the colour parameters. The views are rendered
-    in parallel; their gradients are summed in a fixed order.
+    The views are rendered in parallel; their gradients are summed in a fixed order.
     """
     settings = inputs.settings
     chosen = torch.randint(len(inputs.train), (settings.frames_per_step,), generator=generator).tolist()
     backgrounds = [torch.rand(3, generator=generator) for _ in chosen]
     phases = torch.randint(settings.pixel_stride, (len(chosen),), generator=generator).tolist()
 
-    def gradients_of_view(k: int, background: Float[Tensor, "3"], phase: int) -> Sequence[Tensor]:
+    def gradients_of_view(
+        k: int, background: Float[Tensor, "3"], phase: int
+    ) -> tuple[Sequence[Tensor | None], FeatureGradients]:
         leaf_vertices = vertices.detach().requires_grad_(vertices.requires_grad)
-        colour_loss, silhouette_loss = sampled_losses(
-            leaf_vertices, skin, inputs.train[k], inputs.shader, background, (settings.pixel_stride, phase)
-        )
+        feature_gradients: FeatureGradients = []
+        shader, lattice = colours.shader(feature_gradients), (settings.pixel_stride, phase)
+        colour_loss, silhouette_loss = sampled_losses(leaf_vertices, skin, inputs.train[k], shader, background, lattice)
         loss = (settings.colour_weight * colour_loss + settings.silhouette_weight * silhouette_loss) / len(chosen)
-        # A view without a covered pixel has no gradient of the colours: it is zero.
-        gradient_inputs = ([leaf_vertices] if leaf_vertices.requires_grad else []) + list(colours)
-        return torch.autograd.grad(loss, gradient_inputs, materialize_grads=True)
+        leaves = ([leaf_vertices] if leaf_vertices.requires_grad else []) + colours.leaves
+        return torch.autograd.grad(loss, leaves, allow_unused=True), feature_gradients
 
-    views = threads.map(gradients_of_view, chosen, backgrounds, phases)
-    return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]
+    by_view, features = zip(*threads.map(gradients_of_view, chosen, backgrounds, phases), strict=True)
+    summed = [_sum_of_present(gradients) for gradients in zip(*by_view, strict=True)]
+    of_vertices = summed.pop(0) if vertices.requires_grad else None
+    return BatchGradients(of_vertices, summed, [part for parts in features for part in parts])
+
+
+def _sum_of_present(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum, in order, of the gradients that are not None; None if there is none."""
+    present = [gradient for gradient in gradients if gradient is not None]
+    return reduce(torch.add, present) if present else None
 
 
 def regularisation_gradients(

@@ -9,12 +9,13 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.capture.matting import resize_premultiplied
-from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.differentiable_raster import render_pixels, render_shaded
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.differentiable_raster import render_pixels
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
+from pipeline.kernels.skinned_projection import project_skinned
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, validation_psnr_db
 
@@ -43,6 +44,14 @@ class PosedView:
     def pose_vertices(self, vertices: Float[Tensor, "v 3"], weights: Float[Tensor, "v j"]) -> Float[Tensor, "v 3"]:
         """Return the vertices in the pose of this view (m, world) by linear blend skinning."""
         return linear_blend_skinning(vertices, weights, self.canonical_to_world[None])[0]
+
+    def project_vertices(
+        self, vertices: Float[Tensor, "v 3"], skin: SkinnedTopology
+    ) -> tuple[Float[Tensor, "v 2"], Float[Tensor, "v"]]:
+        """Return pixel positions and depths (m) of the vertices in the pose of this view; differentiable in them."""
+        world_to_camera = torch.from_numpy(np.asarray(self.camera.world_to_camera)).to(self.canonical_to_world)
+        canonical_to_camera = world_to_camera @ self.canonical_to_world
+        return project_skinned(vertices, skin.sparse_weights, canonical_to_camera, self.camera.intrinsics_px)
 
     def scaled(self, factor: float) -> "PosedView":
         """Return the view with its picture resized by `factor` (at most 1), by area averaging."""
@@ -98,8 +107,8 @@ def render_posed_view(
 
     The shader is evaluated at canonical points. Differentiable as `render_shaded`.
     """
-    posed = view.pose_vertices(vertices, skin.weights)
-    return render_shaded(posed, skin.faces, view.camera, vertices, shader, skin.adjacency)
+    topology, size = (skin.faces, skin.adjacency), (view.camera.height, view.camera.width)
+    return render_pixels(*view.project_vertices(vertices, skin), topology, size, vertices, shader).image()
 
 
 def composite_target(
@@ -134,11 +143,11 @@ def sampled_losses(
     lattice: stride and phase; in all phases of a stride each pixel is used once.
     """
     stride, phase = lattice
-    height, width = view.mask.shape
+    size = height, width = view.camera.height, view.camera.width
     rows, columns = torch.arange(height)[:, None], torch.arange(width)
     wanted = (columns + (1 if stride == 2 else 2) * rows + phase) % stride == 0
-    posed = view.pose_vertices(vertices, skin.weights)
-    drawn = render_pixels(posed, skin.faces, view.camera, vertices, shader, skin.adjacency, wanted)
+    topology = skin.faces, skin.adjacency
+    drawn = render_pixels(*view.project_vertices(vertices, skin), topology, size, vertices, shader, wanted)
     pixels = view.image.reshape(-1, 3)[drawn.pixel], view.mask.reshape(-1)[drawn.pixel]
     target, mask = _composite(*pixels, background)
     alpha = drawn.values[:, -1]
@@ -184,8 +193,8 @@ def silhouette_iou(mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView]
     intersection_px = union_px = 0
     vertices = torch.from_numpy(mesh.vertices)
     for view in views:
-        posed, camera = view.pose_vertices(vertices, skin.weights), view.camera
-        covered = rasterize(*project(posed, camera), skin.faces, camera.height, camera.width)[0] >= 0
+        projected, camera = view.project_vertices(vertices, skin), view.camera
+        covered = rasterize(*projected, skin.faces, camera.height, camera.width)[0] >= 0
         mask = view.mask > 127
         intersection_px += int((covered & mask).sum())
         union_px += int((covered | mask).sum())

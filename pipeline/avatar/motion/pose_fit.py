@@ -64,5 +64,5 @@ def _surface(avatar: TexturedAvatar, joint_count: int) -> AlignedSurface:
             return albedo
         return linear_to_srgb(srgb_to_linear(albedo) * values[:, 2:]).clamp(0.0, 1.0)
 
-    skin = SkinnedTopology(avatar.faces_uv.long(), face_adjacency(avatar.faces), weights)
+    skin = SkinnedTopology(avatar.faces_uv.to(torch.int32), face_adjacency(avatar.faces), weights)
     return AlignedSurface(avatar.vertices[vertex_of_uv], skin, attributes, shade)

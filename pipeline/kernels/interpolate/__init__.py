@@ -30,7 +30,7 @@ def interpolate(
     """
     if not runs_on_numba(vertices_px, depth_m, attributes):
         return interpolate_reference(covered, face_ids, width, vertices_px, depth_m, faces, attributes)
-    return _Interpolate.apply(covered, face_ids, width, vertices_px, depth_m, faces, attributes)
+    return _Interpolate.apply(covered, face_ids, width, vertices_px, depth_m, faces.to(torch.int32), attributes)
 
 
 class _Interpolate(torch.autograd.Function):

@@ -1,17 +1,14 @@
 """Compiled loops of perspective-correct interpolation and its gradient: one pass over the covered pixels each.
 
 Notation: a, b, c corners of the face relative to the pixel centre (px); e_k edge functions at the centre, A their sum;
-q_k = e_k / (A z_k), S = q_0 + q_1 + q_2; barycentrics b_k = q_k / S. The gradient of each block of pixels is summed
-into a private copy, and the copies are added in block order: the result does not depend on the number of threads.
+q_k = e_k / (A z_k), S = q_0 + q_1 + q_2; barycentrics b_k = q_k / S. The gradient is summed on one thread, in the
+order of the pixels: views are drawn in parallel, and a copy of the gradient for each thread is as large as the mesh.
 """
 
 import numpy as np
 from numba import njit, prange
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
-
-BLOCKS = 2
-"""Each block costs a copy of the gradient, which is as large as the mesh; views are drawn in parallel besides."""
 
 
 @njit(**NJIT_OPTIONS)
@@ -103,7 +100,7 @@ def _add_pixel(
     out[k, 1] += f0 * bx - f1 * ax
 
 
-@njit(parallel=True, **NJIT_OPTIONS)
+@njit(**NJIT_OPTIONS)
 def interpolate_backward(
     covered: np.ndarray,
     face_ids: np.ndarray,
@@ -115,15 +112,8 @@ def interpolate_backward(
     upstream: np.ndarray,
 ) -> np.ndarray:
     """Return the gradient (v, 3 + c) of position (px), depth and attributes; upstream (n, c): that of the values."""
-    count, size = len(covered), 3 + attributes.shape[1]
-    parts = np.zeros((BLOCKS, len(vertices_px), size), np.float32)
-    for block in prange(BLOCKS):
-        for n in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
-            pixel = (covered[n], face_ids[n])
-            _add_pixel(pixel, width, vertices_px, depth_m, faces, attributes, upstream[n], parts[block])
-    total = np.zeros((len(vertices_px), size), np.float32)
-    for v in prange(len(vertices_px)):
-        for block in range(BLOCKS):
-            for c in range(size):
-                total[v, c] += parts[block, v, c]
+    total = np.zeros((len(vertices_px), 3 + attributes.shape[1]), np.float32)
+    for n in range(len(covered)):
+        pixel = (covered[n], face_ids[n])
+        _add_pixel(pixel, width, vertices_px, depth_m, faces, attributes, upstream[n], total)
     return total

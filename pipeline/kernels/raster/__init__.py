@@ -42,9 +42,9 @@ def rasterize(
     >>> rasterize(corners, torch.ones(3), torch.tensor([[0, 1, 2]]), 2, 2)[0].tolist()
     [[0, 0], [0, 0]]
     """
-    if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices_px):
-        span = f"{int(faces.min())}..{int(faces.max())}"
-        raise IndexError(f"faces refer to vertices {span}, the mesh has {len(vertices_px)}")
+    low, high = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
+    if low < 0 or high >= len(vertices_px):
+        raise IndexError(f"faces refer to vertices {low}..{high}, the mesh has {len(vertices_px)}")
     vertices_px, depth_m = vertices_px.detach(), depth_m.detach()
     if not runs_on_numba(vertices_px, depth_m):
         return rasterize_reference(vertices_px, depth_m, faces, height, width, near_m, cull_backfaces)
@@ -81,7 +81,8 @@ def silhouette_blends(
     if not runs_on_numba(vertices_px, depth_m):
         edges = silhouette_edges(vertices_px.detach(), faces.long(), adjacency.long())
         return reference.silhouette_blends(face_id, depth, vertices_px, depth_m, edges)
-    edges = silhouette_edges_cpu(*(part.detach().contiguous().numpy() for part in (vertices_px, faces, adjacency)))
+    topology = (part.to(torch.int32).contiguous().numpy() for part in (faces, adjacency))
+    edges = silhouette_edges_cpu(vertices_px.detach().contiguous().numpy(), *topology)
     fraction, pixels = _Fractions.apply(vertices_px, depth_m, face_id, depth, edges)
     target, near, far = pixels.unbind(1)
     return SilhouetteBlends(target, near, far, fraction)
