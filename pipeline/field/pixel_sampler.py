@@ -134,19 +134,27 @@ def build_pixel_pool(
     return PixelPool(np.concatenate(xy), np.concatenate(rgba), np.array(starts, dtype=np.int64))
 
 
-def _classify_pixels(mask: UInt8[np.ndarray, "h w"], border_px: int, rng: np.random.Generator) -> list[tuple]:
+def _classify_pixels(
+    mask: UInt8[np.ndarray, "h w"], border_px: int, rng: np.random.Generator
+) -> list[tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]]:
     """Return (rows, columns) of the body, border and outside pixels of one mask."""
+    sides = [np.flatnonzero((mask >= 128).any(axis=axis)) for axis in (1, 0)]
+    if not len(sides[0]):
+        return [(sides[0], sides[1])] * len(PIXEL_CLASSES)
+    # The mask dilated by `border_px`, and the bounding box of the outside pixels.
+    low, high = (
+        np.clip([side[end] + sign * border_px for side in sides], 0, np.array(mask.shape) - 1)
+        for end, sign in ((0, -1), (-1, 1))
+    )
+    pad = 8 + int(0.1 * (high[0] - low[0] + 1))
+    first = np.maximum(low - pad, 0)
+    mask = mask[first[0] : high[0] + pad, first[1] : high[1] + pad]
     solid = (mask >= 128).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * border_px + 1, 2 * border_px + 1))
     outer, inner = cv2.dilate(solid, kernel), cv2.erode(solid, kernel, borderValue=(0,))
     border = (outer > inner) | ((mask > 0) & (mask < 255) & (outer > 0))
-    rows, columns = np.nonzero(outer)
-    outside = np.zeros(mask.shape, dtype=bool)
-    if len(rows):
-        pad = 8 + int(0.1 * (np.ptp(rows) + 1))
-        outside[max(rows.min() - pad, 0) : rows.max() + pad, max(columns.min() - pad, 0) : columns.max() + pad] = True
-    outside &= (outer == 0) & (mask == 0)
-    outside_index = np.flatnonzero(outside)
+    outside_index = np.flatnonzero((outer == 0) & (mask == 0))
     if len(outside_index) > MAX_OUTSIDE_PIXELS_PER_FRAME:
         outside_index = np.sort(rng.choice(outside_index, MAX_OUTSIDE_PIXELS_PER_FRAME, replace=False))
-    return [np.nonzero(solid & ~border), np.nonzero(border), np.unravel_index(outside_index, mask.shape)]
+    by_class = np.nonzero(solid & ~border), np.nonzero(border), np.unravel_index(outside_index, mask.shape)
+    return [(rows + first[0], columns + first[1]) for rows, columns in by_class]

@@ -128,8 +128,8 @@ def optimise_vertices(
 class BatchGradients(NamedTuple):
     """Gradients of the mean loss of some views.
 
-    vertices: None if they are not optimised, or not seen. colours: of `ColourOptimiser.leaves`; None where autograd has none.
-    features: of the hash grid, in the order of the views.
+    vertices: None if they are not optimised, or not seen. colours: of `ColourOptimiser.leaves`; None where autograd has
+    none. features: of the hash grid, in the order of the views.
     """
 
     vertices: Float[Tensor, "v 3"] | None
