@@ -141,7 +141,7 @@ def _classify_pixels(
     sides = [np.flatnonzero((mask >= 128).any(axis=axis)) for axis in (1, 0)]
     if not len(sides[0]):
         return [(sides[0], sides[1])] * len(PIXEL_CLASSES)
-    # The mask dilated by `border_px`, and the bounding box of the outside pixels.
+    # Corners of the bounding box of the mask dilated by `border_px`; outside pixels are at most `pad` away from it.
     low, high = (
         np.clip([side[end] + sign * border_px for side in sides], 0, np.array(mask.shape) - 1)
         for end, sign in ((0, -1), (-1, 1))

@@ -1,6 +1,6 @@
 """Solution of a sparse symmetric positive definite system, factorised once, for many right-hand sides.
 
-The factors of SuperLU are kept in single precision, and its solver is not used: it takes three to six times as long
+The factors of SuperLU are kept in single precision, and its solver is not used: it takes two to four times as long
 (docs/decisions/engineering.md). Notation: n unknowns, e entries below the diagonal.
 """
 
