@@ -16,12 +16,14 @@ from pipeline.capture.capture import Capture, image_path, mask_path, save_captur
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
+from pipeline.field.field import FieldColours, RadianceField, hash_grid_layout
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.geometry.surface import isosurface
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
+from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.mesh.files import load_mesh
 from pipeline.mesh.pose_alignment import AlignedSurface
 from pipeline.mesh.settings import MeshSettings
@@ -58,14 +60,15 @@ def capsule_mesh(radius: float) -> Mesh:
     return isosurface(capsule(points, radius), 0.0, points[0, 0, 0], 0.03)
 
 
-class CapsuleField(torch.nn.Module):
+class CapsuleField(RadianceField):
     """Density and colour of a capsule that is 3 cm thicker than the body; its mean brightness is a parameter."""
 
     def __init__(self) -> None:
-        super().__init__()
+        bounds_m = np.array([[-1.0] * 3, [1.0] * 3])
+        super().__init__(bounds_m, hash_grid_layout(bounds_m, 1.0, 1, 1, 4))
         self.mean = torch.nn.Parameter(torch.tensor(0.5))
 
-    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def radiance(self, points: Tensor, feature_gradients: FeatureGradients | None = None) -> tuple[Tensor, Tensor]:
         return self.mean + 0.4 * torch.sin(points * 20.0), self.density(points)
 
     def density(self, points: Tensor) -> Tensor:
@@ -275,7 +278,7 @@ def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -
     mesh = capsule_mesh(0.18)
     share = torch.linspace(0.0, 1.0, len(mesh.vertices))
     skin = build_skinned_topology(mesh, torch.stack([1 - share, share], dim=1))
-    mesh_stage.write_results(tmp_path, mesh, skin, mesh_stage.FieldColourShader(CapsuleField()))
+    mesh_stage.write_results(tmp_path, mesh, skin, FieldColours(CapsuleField()))
     exported = load_mesh(tmp_path).dense_skin_weights(2)
     np.testing.assert_allclose(exported[:, 1], share, atol=1e-6)
 
