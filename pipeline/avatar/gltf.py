@@ -235,7 +235,7 @@ def _add_camera(document: GlbWriter, camera: Camera) -> int:
         "znear": 0.05,
     }
     extras = {
-        "intrinsics_px": [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)],
+        "intrinsics_px": [float(value) for value in camera.intrinsics_px],
         "size_px": [camera.width, camera.height],
     }
     index = document.add("cameras", {"name": "capture_camera", "type": "perspective", "perspective": perspective})

@@ -92,7 +92,7 @@ def save_capture(capture: Capture) -> None:
     Images and masks are written separately, while they are computed.
     """
     camera = capture.camera
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else (np.nan,) * 4
+    intrinsics = camera.intrinsics_px if camera else (np.nan,) * 4
     arrays: dict[str, np.ndarray] = {
         "frame_index": capture.frame_index.astype(np.int32),
         "time_s": capture.time_s.astype(np.float64),

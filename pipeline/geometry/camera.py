@@ -61,7 +61,7 @@ class Camera:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the camera as named arrays for an npz file; `from_arrays` is the inverse."""
         return {
-            "camera_intrinsics_px": np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64),
+            "camera_intrinsics_px": np.array(self.intrinsics_px, dtype=np.float64),
             "camera_size_px": np.array([self.width, self.height], dtype=np.int32),
             "camera_world_to_camera": np.asarray(self.world_to_camera, dtype=np.float32),
         }
