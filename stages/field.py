@@ -15,7 +15,7 @@ from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import Capture, image_path, load_capture, mask_path
 from pipeline.capture.frame_selection import evenly_spaced
-from pipeline.capture.matting import resize_premultiplied
+from pipeline.capture.masks.matting import resize_premultiplied
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.device import select_device

@@ -240,7 +240,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=15,
+    version=16,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

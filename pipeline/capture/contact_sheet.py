@@ -7,7 +7,7 @@ from jaxtyping import UInt8
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import HELDOUT, VALIDATION, evenly_spaced
 from pipeline.capture.landmarks import POSE_CONNECTIONS
-from pipeline.capture.matting import inner_boundary
+from pipeline.capture.masks.matting import inner_boundary
 from pipeline.io.image import to_uint8
 
 _TILE_HEIGHT_PX, _COLUMNS, _ROWS = 320, 8, 3

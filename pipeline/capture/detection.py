@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.capture.background_plate import BackgroundPlate, estimate_background_plate
 from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.capture.face_detector import FaceDetector, undetected_face
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.hand_detector import HandDetector, HandLandmarks, stack_hands, undetected_hands
 from pipeline.capture.landmarks import N_LANDMARKS
-from pipeline.capture.matting import (
+from pipeline.capture.masks.background_plate import BackgroundPlate, estimate_background_plate
+from pipeline.capture.masks.matting import (
     decontaminate_colours,
     definite_background,
     estimate_alpha_matte,

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.capture.background_plate import detect_scene_changes
 from pipeline.capture.detection import Detections
 from pipeline.capture.frame_selection import evenly_spaced, format_frame_ranges
 from pipeline.capture.landmarks import ANKLES, FEET, TORSO
+from pipeline.capture.masks.background_plate import detect_scene_changes
 from pipeline.capture.person_detector import is_ankle_visible
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn

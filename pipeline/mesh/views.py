@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.capture.matting import resize_premultiplied
+from pipeline.capture.masks.matting import resize_premultiplied
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.differentiable_raster import render_pixels
 from pipeline.geometry.mesh import Mesh

@@ -3,8 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
-from pipeline.capture import matting as matte
+from pipeline.capture.masks import matting as matte
+from pipeline.capture.masks.colour_distribution import ColourDistribution, log_density, solve_symmetric
 
 SIDE_PX = 64
 
@@ -309,5 +311,25 @@ def test_symmetric_systems_are_solved_as_by_lapack():
     matrix = matrix @ matrix.swapaxes(-1, -2) + 1e-4 * np.eye(3)
     right = random.normal(size=(7, 9, 3))
     upper = np.stack([matrix[..., i, j] for i in range(3) for j in range(i, 3)])
-    found = np.stack(matte._solve_symmetric(upper, np.moveaxis(right, -1, 0)), axis=-1)
+    found = np.stack(solve_symmetric(upper, np.moveaxis(right, -1, 0)), axis=-1)
     np.testing.assert_allclose(found, np.linalg.solve(matrix, right[..., None])[..., 0], rtol=1e-6)
+
+
+def test_log_density_is_that_of_scipy_until_the_colour_is_far():
+    random = np.random.default_rng(6)
+    spread = random.normal(0, 0.05, (4, 5, 3, 3))
+    covariance = spread @ spread.swapaxes(-1, -2)
+    upper = np.stack([covariance[..., i, j] for i in range(3) for j in range(i, 3)])
+    weight = np.ones((4, 5))
+    weight[0, 0] = 0
+    distribution = ColourDistribution(weight, random.random((4, 5, 3)), upper)
+    image = np.float32(distribution.mean.repeat(4, axis=0).repeat(4, axis=1) + random.normal(0, 0.05, (16, 20, 3)))
+    rows, columns = np.indices((16, 20)).reshape(2, -1)
+    found = log_density(image, distribution, (rows, columns)).reshape(16, 20)
+    for row, column in ((5, 9), (15, 19), (8, 0)):
+        point = row // 4, column // 4
+        normal = multivariate_normal(distribution.mean[point], covariance[point] + (3 / 255) ** 2 * np.eye(3))
+        peak = normal.logpdf(normal.mean)
+        expected = max(normal.logpdf(image[row, column]), peak - 15) + 1.5 * np.log(2 * np.pi)
+        assert found[row, column] == pytest.approx(expected, abs=1e-3)
+    assert np.isinf(found[:4, :4]).all()

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.capture import matting as matte
+from pipeline.capture.masks import matting as matte
 from tests.capture.test_matting import composite, detector_mask, figure
 
 CELL_PX = 1.4

@@ -4,29 +4,32 @@ Notation: I observed colour of a pixel, F and B colours of foreground (person) a
 covered fraction of the pixel: I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
 """
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.capture.background_plate import BackgroundPlate, largest_difference, subtract_background
+from pipeline.capture.masks.background_plate import (
+    BackgroundPlate,
+    PlateComparison,
+    compare_with_plate,
+    largest_difference,
+    least_alpha,
+)
+from pipeline.capture.masks.colour_distribution import (
+    ColourDistribution,
+    fisher_discriminant,
+    local_colour_distribution,
+    log_density,
+)
 
 # The detector's mask has 256 cells on a square of 1.25 times the person's height.
 _MASK_CELLS_PER_PERSON_HEIGHT = 256 / 1.25
 # In cells: half width of the unknown band around the detector's outline, and radius of the colour window. Radii of
 # 3 / 6 / 9 / 12 cells give an IoU of 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
 _UNKNOWN_BAND_CELLS, _COLOUR_WINDOW_CELLS = 3.0, 6.0
-# Minimum standard deviation of a colour distribution (of 1): rounding. Colours are averaged over cells first, so video
-# noise is small, and a white coat in front of a white wall needs every level.
-_COLOUR_NOISE = 1.0 / 255.0
 # Weight of the detector's mask, in units of a squared Mahalanobis distance: at its outline, and far from it.
 _PRIOR_WEIGHT_AT_EDGE, _PRIOR_WEIGHT_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
-# A wider window (factor) contributes with a small weight; it has the only samples in a gap between arm and torso.
-_WIDE_WINDOW_FACTOR, _WIDE_WINDOW_WEIGHT = 8, 0.01
-# Minimum mean weight of a colour distribution: a tenth of the wide window.
-_MIN_SAMPLE_WEIGHT = 1e-3
 # The background is uniform (synthetic) if this fraction of its pixels is within two levels of one colour.
 _MIN_UNIFORM_FRACTION, _UNIFORM_TOLERANCE_LEVELS = 0.95, 2
 # The same on every fourth pixel outside of the mask, some of which show what the mask misses.
@@ -34,6 +37,10 @@ _UNIFORM_TEST_STRIDE, _MIN_UNIFORM_FRACTION_SAMPLED = 4, 0.8
 # Above this mask value a pixel is a foreground sample even if the first iteration rejected it. Without that a white hem
 # in front of a white wall is lost (synthetic captures, IoU median and worst: 0.978, 0.945; with it 0.991, 0.959).
 _CONFIDENT_MASK_VALUE = 0.97
+# Minimum logarithm of the ratio of likelihoods, plate to person, mean over 3 x 3 pixels, for background.
+_MIN_LOG_RATIO = 4.0
+# The opposite at most, and where the plate is far off: one such pixel keeps its neighbours.
+_FAR_LOG_RATIO = 20.0
 # Half width of the soft rim: this many standard deviations of the image's own blur, at least the minimum.
 _MIN_RIM_PX, _RIM_PER_BLUR = 1.0, 2.0
 # Blur estimation: standard deviation of the second blur, window in cells along the outline, and the apparent variance
@@ -48,14 +55,6 @@ _MIN_TRACE_LEVEL = 25
 _MIN_COMPONENT_FRACTION, _MAX_HOLE_FRACTION = 0.05, 2e-4
 
 
-class _ColourDistribution(NamedTuple):
-    """Colour statistics around each grid point: mean weight, mean, covariance (xx, xy, xz, yy, yz, zz)."""
-
-    weight: Float[np.ndarray, "h w"]
-    mean: Float[np.ndarray, "h w 3"]
-    covariance: Float[np.ndarray, "6 h w"]
-
-
 def estimate_alpha_matte(
     rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], plate: BackgroundPlate | None = None
 ) -> Float[np.ndarray, "h w"]:
@@ -65,7 +64,8 @@ def estimate_alpha_matte(
     position of the pixel's colour between both means along Fisher's linear discriminant. It is averaged with the coarse
     mask, weighted by certainty: the squared Mahalanobis distance of the distributions, and the distance of the mask
     from 0.5. Two iterations, so that the distributions use the better outline. Only a band around the outline can be
-    added to the mask. Pixels in the band that differ from `plate` are foreground.
+    added to the mask. Pixels in the band that differ from `plate` are foreground, and pixels that the plate explains
+    better than the person's colours do are background.
     """
     if not (mask > 127).any():
         return np.zeros(mask.shape, dtype=np.float32)
@@ -77,19 +77,21 @@ def estimate_alpha_matte(
     coarse_alpha = mask[window].astype(np.float32) / 255.0
     cell_px = _mask_cell_px(coarse_alpha > 0.5)
     unknown_band = _dilate(coarse_alpha > 0.5, _UNKNOWN_BAND_CELLS * cell_px)
-    definite_foreground = (
-        np.zeros_like(unknown_band)
-        if plate is None
-        else subtract_background(rgb[window], plate.window(*window), unknown_band)
-    )
+    seen = None if plate is None else compare_with_plate(rgb[window], plate.window(*window), unknown_band)
     alpha = coarse_alpha
-    for _ in range(2):
-        alpha = np.where(
-            unknown_band, np.maximum(_update_alpha(image, alpha, coarse_alpha, cell_px), definite_foreground), 0.0
-        ).astype(np.float32)
+    for iteration in range(2):
+        person = _person_colours(image, alpha, coarse_alpha, cell_px)
+        alpha = _update_alpha(image, alpha, coarse_alpha, cell_px, person)
+        if iteration == 0:
+            blur_px = estimate_edge_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px)
+            rim_px = np.clip(_RIM_PER_BLUR * blur_px, _MIN_RIM_PX, _UNKNOWN_BAND_CELLS * cell_px)
+        if seen is not None:
+            alpha = np.where(_shows_plate(image, person, seen, unknown_band), 0.0, alpha)
+            alpha = np.maximum(alpha, least_alpha(seen.difference, _typical_px(rim_px, blur_px > 0.0)))
+        alpha = np.where(unknown_band, alpha, 0.0).astype(np.float32)
     full_alpha = np.zeros(mask.shape, dtype=np.float32)
-    rim_px = np.maximum(_RIM_PER_BLUR * estimate_edge_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px), _MIN_RIM_PX)
-    full_alpha[window] = clean_alpha_matte(alpha, np.minimum(rim_px, _UNKNOWN_BAND_CELLS * cell_px))
+    alpha = clean_alpha_matte(alpha, rim_px)
+    full_alpha[window] = alpha if seen is None else _fill_prints(alpha, coarse_alpha, seen.known, cell_px)
     return full_alpha
 
 
@@ -262,98 +264,88 @@ def _bounding_slices(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[sli
     )
 
 
+def _typical_px(lengths_px: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> int:
+    """Return the median of some lengths, rounded; at least 1."""
+    return max(1, round(float(np.median(lengths_px[where])))) if where.any() else 1
+
+
+def _person_colours(
+    image: Float[np.ndarray, "h w 3"],
+    alpha: Float[np.ndarray, "h w"],
+    coarse_alpha: Float[np.ndarray, "h w"],
+    cell_px: float,
+) -> ColourDistribution:
+    """Return the colours of the person around each point of a grid as coarse as the detector's."""
+    height, width = alpha.shape
+    grid = max(1, round(width / cell_px)), max(1, round(height / cell_px))
+    inside = np.maximum(alpha, coarse_alpha > _CONFIDENT_MASK_VALUE)
+    weight = np.clip(2.0 * inside - 1.0, 0.0, 1.0) ** 2
+    return local_colour_distribution(image, weight, grid, round(_COLOUR_WINDOW_CELLS))
+
+
+def _shows_plate(
+    image: Float[np.ndarray, "h w 3"],
+    person: ColourDistribution,
+    seen: PlateComparison,
+    unknown_band: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of the band that the plate explains better than the colours of the person do, with their
+    neighbours.
+    """
+    rows, columns = np.nonzero(seen.is_near & unknown_band)
+    pixels = rows, columns
+    log_ratio = np.where(seen.known, np.float32(_FAR_LOG_RATIO), np.float32(0.0))
+    log_ratio[pixels] = np.minimum(log_density(image, person, pixels) - seen.log_density[pixels], _FAR_LOG_RATIO)
+    return seen.known & (cv2.blur(log_ratio, (3, 3)) < -_MIN_LOG_RATIO)
+
+
+def _fill_prints(
+    alpha: Float[np.ndarray, "h w"],
+    coarse_alpha: Float[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"],
+    cell_px: float,
+) -> Float[np.ndarray, "h w"]:
+    """Set alpha to 1 in mostly opaque parts inside the person where the recording never shows the scene behind.
+
+    A print in the colour of the wall looks like a gap; a gap between arm and trunk shows the wall, which other frames
+    show too.
+    """
+    inside = ~_dilate(coarse_alpha <= 0.5, cell_px) & (coarse_alpha > _CONFIDENT_MASK_VALUE)
+    count, labels = cv2.connectedComponents(((alpha < 1.0) & inside).astype(np.uint8), connectivity=8)
+    opacity, hidden, area = (
+        np.bincount(labels.ravel(), None if weight is None else weight.ravel(), count)
+        for weight in (alpha, ~known, None)
+    )
+    is_print = (opacity > 0.5 * area) & (hidden > 0.5 * area)
+    is_print[0] = False
+    return np.where(is_print[labels], np.float32(1.0), alpha)
+
+
 def _update_alpha(
     image: Float[np.ndarray, "h w 3"],
     alpha: Float[np.ndarray, "h w"],
     coarse_alpha: Float[np.ndarray, "h w"],
     cell_px: float,
+    person: ColourDistribution,
 ) -> Float[np.ndarray, "h w"]:
     """Return alpha after one iteration of `estimate_alpha_matte`.
 
-    The colour distributions are smooth, so they and the discriminant are computed on a grid as coarse as the detector's
-    and enlarged.
+    person: colours of the person around each point of a grid as coarse as the detector's. They are smooth, and the
+    discriminant is, so both are computed there and enlarged.
     """
     height, width = alpha.shape
-    small = (max(1, round(width / cell_px)), max(1, round(height / cell_px)))
-    radius = round(_COLOUR_WINDOW_CELLS)
-    inside = np.maximum(alpha, coarse_alpha > _CONFIDENT_MASK_VALUE)
-    person = _local_colour_distribution(image, np.clip(2.0 * inside - 1.0, 0.0, 1.0) ** 2, small, radius)
-    background = _local_colour_distribution(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, small, 2 * radius)
+    weight = np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2
+    rows, columns = person.weight.shape
+    background = local_colour_distribution(image, weight, (columns, rows), 2 * round(_COLOUR_WINDOW_CELLS))
     direction, offset, certainty = (
         cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-        for field in _fisher_discriminant(person, background)
+        for field in fisher_discriminant(person, background)
     )
     position = cv2.transform(cv2.multiply(image, direction), np.ones((1, 3), dtype=np.float32)) - offset
     prior = np.clip((coarse_alpha - 0.5) / (2.0 * _PRIOR_RAMP) + 0.5, 0.0, 1.0)
     prior_weight = _PRIOR_WEIGHT_AT_EDGE + _PRIOR_WEIGHT_CERTAIN * (2.0 * coarse_alpha - 1.0) ** 2
     total = certainty * np.clip(position, -0.2, 1.2) + prior_weight * prior
     return np.clip(total / (certainty + prior_weight), 0.0, 1.0)
-
-
-def _local_colour_distribution(
-    image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], small: tuple[int, int], radius: int
-) -> _ColourDistribution:
-    """Return weighted mean and covariance of colours in a window around each point of a coarse grid, plus a wider
-    window.
-
-    small: columns and rows of the grid. radius: half of the window in grid points. Colours are averaged over the grid's
-    cells before products are formed: texture finer than a cell does not count as variance.
-    """
-    weight = weight.astype(np.float32)
-    share = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
-    weighted = cv2.resize(cv2.multiply(image, cv2.merge([weight] * 3)), small, interpolation=cv2.INTER_AREA)
-    colour = weighted / (share[..., None] + 1e-6)
-
-    def box_filter(values: np.ndarray) -> np.ndarray:
-        near, far = (
-            cv2.blur(values, (2 * half_width + 1, 2 * half_width + 1), borderType=cv2.BORDER_CONSTANT)
-            for half_width in (radius, _WIDE_WINDOW_FACTOR * radius)
-        )
-        return near + np.float32(_WIDE_WINDOW_WEIGHT) * far
-
-    total = box_filter(share)
-    scale = 1.0 / (total + 1e-6)
-    mean = box_filter(weighted) * scale[..., None]
-    sums, colours, means = cv2.split(weighted), cv2.split(colour), cv2.split(mean)
-    covariance = [
-        box_filter(cv2.multiply(sums[i], colours[j])) * scale - means[i] * means[j]
-        for i in range(3)
-        for j in range(i, 3)
-    ]
-    return _ColourDistribution(total, mean, np.stack(covariance))
-
-
-def _fisher_discriminant(
-    person: _ColourDistribution, background: _ColourDistribution
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Return direction, offset and certainty of Fisher's linear discriminant of two colour distributions per grid
-    point.
-
-    direction . I - offset is 0 for I = B and 1 for I = F. With S the sum of both covariances and d = F - B: w = S^-1 d,
-    direction = w / w.d, offset = direction . B, certainty = w.d, the squared Mahalanobis distance of the means (0
-    where a distribution is empty).
-    """
-    pooled = (person.covariance + background.covariance).astype(np.float64)
-    pooled[[0, 3, 5]] += _COLOUR_NOISE**2
-    difference = (person.mean - background.mean).astype(np.float64)
-    w = np.stack(_solve_symmetric(pooled, np.moveaxis(difference, -1, 0)), axis=-1)
-    certainty = (w * difference).sum(axis=-1)
-    direction = w / np.maximum(certainty, 1e-6)[..., None]
-    offset = (direction * background.mean).sum(axis=-1)
-    certainty = np.where(np.minimum(person.weight, background.weight) > _MIN_SAMPLE_WEIGHT, certainty, 0.0)
-    return direction.astype(np.float32), offset.astype(np.float32), certainty.astype(np.float32)
-
-
-def _solve_symmetric(
-    matrix: Float[np.ndarray, "6 h w"], right: Float[np.ndarray, "3 h w"]
-) -> list[Float[np.ndarray, "h w"]]:
-    """Solve symmetric systems (xx, xy, xz, yy, yz, zz) by their adjugate; LAPACK takes 15 times as long for 3 x 3."""
-    xx, xy, xz, yy, yz, zz = matrix
-    x, y, z = right
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    scale = 1.0 / (xx * a + xy * b + xz * c)
-    return [scale * (a * x + b * y + c * z), scale * (b * x + d * y + e * z), scale * (c * x + e * y + f * z)]
 
 
 def _nearest_pixel_index(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
