@@ -48,7 +48,8 @@ class BackgroundPlate(NamedTuple):
 def estimate_background_plate(
     images: UInt8[np.ndarray, "t h w 3"], person_masks: Bool[np.ndarray, "t h w"]
 ) -> BackgroundPlate:
-    """Return the median over time, per pixel and channel, of the images that do not show the person there.
+    """Return the median over time, per pixel and channel, of the images that do not show the person there, and how much
+    they differ.
 
     images: overwritten (sorted in place), because the array is large.
     person_masks: dilated masks; misses are tolerated in less than half of the images.
@@ -102,7 +103,7 @@ def compare_with_plate(
     squared = cv2.transform(np.square(difference, dtype=np.float32), np.ones((1, 3), np.float32)) / np.square(noise)
     is_near = plate.known & (squared < _MAX_SQUARED_DISTANCE)
     log_density = -0.5 * np.minimum(squared, np.float32(_MAX_SQUARED_DISTANCE)) - 3.0 * np.log(noise / 255.0)
-    unexplained = np.where(changed, reduce(cv2.max, cv2.split(difference)), np.uint8(0))
+    unexplained = np.where(changed, largest_difference(rgb, plate.colour), np.uint8(0))
     return PlateComparison(plate.known, unexplained, log_density, is_near)
 
 

@@ -85,9 +85,10 @@ def estimate_alpha_matte(
         if iteration == 0:
             blur_px = estimate_edge_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px)
             rim_px = np.clip(_RIM_PER_BLUR * blur_px, _MIN_RIM_PX, _UNKNOWN_BAND_CELLS * cell_px)
+            if seen is not None:
+                covered = least_alpha(seen.difference, _typical_px(rim_px, blur_px > 0.0))
         if seen is not None:
-            alpha = np.where(_shows_plate(image, person, seen, unknown_band), 0.0, alpha)
-            alpha = np.maximum(alpha, least_alpha(seen.difference, _typical_px(rim_px, blur_px > 0.0)))
+            alpha = np.maximum(np.where(_shows_plate(image, person, seen, unknown_band), 0.0, alpha), covered)
         alpha = np.where(unknown_band, alpha, 0.0).astype(np.float32)
     full_alpha = np.zeros(mask.shape, dtype=np.float32)
     alpha = clean_alpha_matte(alpha, rim_px)
