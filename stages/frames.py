@@ -10,12 +10,14 @@ from jaxtyping import UInt8
 from pydantic import Field
 
 from pipeline.capture import frame_selection as selection
+from pipeline.capture.camera_motion import camera_motion_px, stabilise_detections
 from pipeline.capture.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
 from pipeline.capture.contact_sheet import contact_sheet
-from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_frames, write_frames
+from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_frames
 from pipeline.capture.detection_checkpoint import load_detections, save_detections
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
+from pipeline.capture.frame_writing import write_frames
 from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
@@ -23,6 +25,7 @@ from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
+from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.io.image import write_rgb
 
@@ -76,6 +79,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
             )
             save_detections(out / CHECKPOINT, detections)
         check_input(detections, source.path, config.min_frames)
+        detections, moved_px = stabilise_camera(detections, source, user_files)
         noise = selection.estimate_noise_level(detections.gray_thumbnails)
         if user_files.split is None:
             selected = select_capture_frames(detections, source.path, config, noise)
@@ -99,12 +103,34 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "dropped_no_person": int((~detections.found).sum()),
         "dropped_duplicates": n_repeats + selected.n_duplicates,
         "noise_levels": noise,
+        "camera_motion_px": moved_px,
         "landmark_visibility": float(np.nan_to_num(capture.landmarks_visibility).mean()),
         "hands_found": float((detections.hands.handedness_score[chosen] > 0.0).mean()),
         "unseen_arc_deg": float(np.degrees(unseen_arc_rad)),
         "turns": selected.turns,
         "scale": detections.scale,
     }
+
+
+def stabilise_camera(detections: Detections, source: FrameSource, user_files: UserFiles) -> tuple[Detections, float]:
+    """Return the detections in stabilised pictures, and how far the camera moved the corners of its picture, px.
+
+    Detections of a still camera stay as they are (0 px); so do all if a camera or SMPL motion is supplied, which
+    belongs to the frames of the recording.
+    """
+    if user_files.camera is not None or user_files.smpl_poses is not None:
+        return detections, 0.0
+    stabilised = stabilise_detections(detections, metadata_focal_px(source, detections.width, detections.height))
+    if stabilised.to_stabilised is None:
+        return detections, 0.0
+    motion_px = camera_motion_px(stabilised.to_stabilised, (stabilised.width, stabilised.height))
+    n_dropped = len(detections.frame_index) - len(stabilised.frame_index)
+    dropped = f", {n_dropped} of them, which would cut off the person, left out" if n_dropped else ""
+    warn(
+        f"the camera of {source.path} moves, its picture by up to {motion_px:.0f} px: the frames are stabilised"
+        f"{dropped}; film with a stand for more detail"
+    )
+    return stabilised, motion_px
 
 
 def select_detection_frames(source: FrameSource, user_files: UserFiles, config: Config) -> tuple[Sequence[int], int]:
@@ -240,7 +266,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=16,
+    version=17,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

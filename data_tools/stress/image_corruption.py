@@ -3,7 +3,7 @@
 Exposure, noise and blur act on linear light, as in a camera, and are rounded to 8 bits afterwards.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.hand_held import hand_held_angles_rad, turn_picture
 from data_tools.synthetic.scene.motion import turn_in_a_pose
 from data_tools.synthetic.scene.renderer import pose_vertices, render_subject
 from pipeline.body.body import Motion, canonical_to_world
@@ -49,18 +50,6 @@ def add_sensor_noise(
     return _to_srgb(linear + std * random.standard_normal(linear.shape))
 
 
-def shift_smoothly(images: Sequence[np.ndarray], amplitude_px: float) -> Images:
-    """Move the images as a hand-held camera does: a sum of two slow sines in x and y of this amplitude."""
-    time = np.arange(len(images)) / max(len(images), 1)
-    x = amplitude_px * (0.7 * np.sin(2 * np.pi * 1.3 * time) + 0.3 * np.sin(2 * np.pi * 3.7 * time + 1.0))
-    y = amplitude_px * (0.7 * np.sin(2 * np.pi * 1.7 * time + 2.0) + 0.3 * np.sin(2 * np.pi * 4.1 * time))
-    size = (images[0].shape[1], images[0].shape[0])
-    return [
-        cv2.warpAffine(image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), size, borderMode=cv2.BORDER_REFLECT)
-        for image, dx, dy in zip(images, x, y, strict=True)
-    ]
-
-
 def _flicker(images: Images, capture: SyntheticCapture, amplitude: float) -> Images:
     return [expose(image, gain) for image, gain in zip(images, flicker_gains(len(images), amplitude), strict=True)]
 
@@ -75,7 +64,9 @@ def _low_light(images: Images, capture: SyntheticCapture, gain: float) -> Images
 
 
 def _hand_held(images: Images, capture: SyntheticCapture, amplitude_px: float) -> Images:
-    return shift_smoothly(images, amplitude_px)
+    focal_px = capture.camera.fx
+    angles_rad = hand_held_angles_rad(len(images), capture.fps, float(np.arctan(amplitude_px / focal_px)))
+    return [turn_picture(image, focal_px, angles) for image, angles in zip(images, angles_rad, strict=True)]
 
 
 def _cut_bottom(images: Images, capture: SyntheticCapture, share: float) -> Images:

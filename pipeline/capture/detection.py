@@ -1,36 +1,24 @@
-"""Two passes over a recording: detect the person in the frames, then write the selected frames with their masks."""
+"""The first pass over a recording: detect the person in the frames."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import islice
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.capture.face_detector import FaceDetector, undetected_face
-from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.hand_detector import HandDetector, HandLandmarks, stack_hands, undetected_hands
 from pipeline.capture.landmarks import N_LANDMARKS
-from pipeline.capture.masks.background_plate import BackgroundPlate, estimate_background_plate
-from pipeline.capture.masks.matting import (
-    decontaminate_colours,
-    definite_background,
-    estimate_alpha_matte,
-    extend_mask_on_uniform_background,
-    smooth_mask_temporally,
-)
 from pipeline.capture.person_detector import PersonDetection, PersonDetector
 from pipeline.capture.user_files import UserFiles
 from pipeline.capture.video import Frame, FrameSource, downscale, read_frames
 from pipeline.capture.worker_pool import WorkerPool
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.io.image import to_uint8, write_gray, write_rgb
 
 # Longer side of the images in which the person is detected: the model sees 256 cells on 1.25 times the person's height.
 DETECTION_SIDE_PX = 640
@@ -42,8 +30,6 @@ THUMBNAIL_SIDE_PX = 320
 _MIN_PERSON_LEVEL = 100
 # Minimum mask area relative to the median; smaller masks are specks.
 _MIN_RELATIVE_AREA = 0.1
-# Maximum number of images of the background estimate; all are in memory at once.
-_MAX_PLATE_FRAMES = 32
 
 
 class _FrameDetection(NamedTuple):
@@ -66,6 +52,8 @@ class Detections:
     gray_thumbnails, person_masks: small images and binary masks.
     masks_png: soft masks of the detector, PNG-encoded to save memory, of at most `DETECTION_SIDE_PX`.
     landmarks, hands and faces_px as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
+    to_stabilised: homographies from the frames to the stabilised pictures that all other values are of
+        (`pipeline.capture.camera_motion`); they act on pixels of the kept size, centres at +0.5. None: not stabilised.
     """
 
     frame_index: Int[np.ndarray, "n"]
@@ -83,6 +71,14 @@ class Detections:
     width: int
     height: int
     scale: float
+    to_stabilised: Float[np.ndarray, "n 3 3"] | None = None
+
+    def rows(self, kept: Bool[np.ndarray, "n"]) -> "Detections":
+        """Return the detections in some of the frames."""
+        arrays = {name: value[kept] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        positions = np.flatnonzero(kept).tolist()
+        masks_png = tuple(self.masks_png[p] for p in positions)
+        return replace(self, **arrays, hands=self.hands.rows(positions), masks_png=masks_png)
 
 
 def detect_in_frames(
@@ -144,60 +140,6 @@ def detect_in_frames(
         height=height,
         scale=scale,
     )
-
-
-def write_frames(
-    source: FrameSource,
-    user_files: UserFiles,
-    detections: Detections,
-    positions: Sequence[int],
-    out: Path,
-    max_side_px: int,
-    noise: float,
-    workers: WorkerPool,
-) -> None:
-    """Write image and mask of the detections at `positions` into `out`.
-
-    User-supplied masks are written unchanged. Masks of the detector are smoothed over neighbouring frames and refined
-    to alpha mattes. Pixels with partial alpha get the estimated foreground colour.
-    """
-    plate = (
-        None if user_files.read_mask is not None else estimate_background(source, user_files, detections, max_side_px)
-    )
-    for folder in (IMAGES_FOLDER, MASKS_FOLDER):
-        (out / folder).mkdir(exist_ok=True)
-    wanted = set(positions)
-    needed = {int(detections.frame_index[p]) for k in wanted for p in _temporal_neighbours(k, detections)}
-    frames = read_undistorted_frames(source, user_files, needed.__contains__, max_side_px)
-
-    def tasks() -> Iterator[tuple[object, ...]]:
-        for position, near in _temporal_windows(frames, detections, wanted):
-            images = np.stack([frame.rgb for frame in near])
-            centre = [frame.index for frame in near].index(int(detections.frame_index[position]))
-            if user_files.read_mask is not None:
-                yield images[centre], read_user_mask(user_files, near[centre]), out, near[centre].index
-            else:
-                masks = [detections.masks_png[p] for p in _temporal_neighbours(position, detections)]
-                yield images, masks, out, near[centre].index, centre, noise, plate
-
-    function = _write_frame if user_files.read_mask is not None else _write_matted_frame
-    for _ in track(workers.map(function, tasks()), "refining masks", total=len(wanted)):
-        pass
-
-
-def estimate_background(
-    source: FrameSource, user_files: UserFiles, detections: Detections, max_side_px: int
-) -> BackgroundPlate:
-    """Return the background plate from evenly spaced images; masks must come from the detector."""
-    found = np.flatnonzero(detections.found)
-    sampled = found[evenly_spaced(len(found), _MAX_PLATE_FRAMES)]
-    is_taken = set(detections.frame_index[sampled].tolist()).__contains__
-    size_px = detections.height, detections.width
-    images = np.empty((len(sampled), *size_px, 3), np.uint8)
-    for image, frame in zip(images, read_undistorted_frames(source, user_files, is_taken, max_side_px), strict=True):
-        image[:] = frame.rgb
-    masks = [~definite_background(_decode_mask(detections.masks_png[p], size_px)) for p in sampled]
-    return estimate_background_plate(images, np.stack(masks))
 
 
 def read_undistorted_frames(
@@ -346,53 +288,3 @@ def _is_person_visible(person_masks: Bool[np.ndarray, "n h w"]) -> Bool[np.ndarr
     area_px = person_masks.sum(axis=(1, 2))
     median_area_px = np.median(area_px[area_px > 0]) if area_px.any() else 0.0
     return (area_px > 0) & (area_px >= _MIN_RELATIVE_AREA * median_area_px)
-
-
-def _temporal_neighbours(position: int, detections: Detections) -> list[int]:
-    """Return the position and its neighbours in time in which a person was found."""
-    neighbours = range(max(0, position - 1), min(len(detections.found), position + 2))
-    return [p for p in neighbours if p == position or detections.found[p]]
-
-
-def _temporal_windows(
-    frames: Iterable[Frame], detections: Detections, wanted: set[int]
-) -> Iterator[tuple[int, list[Frame]]]:
-    """Yield each wanted position in order with its frame and the frames of its neighbours, as soon as they are read."""
-    buffered: dict[int, Frame] = {}
-    pending = sorted(wanted)
-    for frame in frames:
-        buffered[frame.index] = frame
-        while pending:
-            near = [int(detections.frame_index[p]) for p in _temporal_neighbours(pending[0], detections)]
-            if frame.index < near[-1]:
-                break
-            yield pending.pop(0), [buffered[index] for index in near]
-            buffered = {index: kept for index, kept in buffered.items() if index >= near[0]}
-
-
-def _write_frame(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], out: Path, frame_index: int) -> None:
-    write_rgb(image_path(out, frame_index), decontaminate_colours(rgb, mask))
-    write_gray(mask_path(out, frame_index), mask)
-
-
-def _write_matted_frame(
-    images: UInt8[np.ndarray, "t h w 3"],
-    masks_png: Sequence[bytes],
-    out: Path,
-    frame_index: int,
-    centre: int,
-    noise: float,
-    plate: BackgroundPlate,
-) -> None:
-    """Compute and write the matte of one frame (runs in a worker thread)."""
-    height, width = images.shape[1:3]
-    masks = np.stack([_decode_mask(data, (height, width)) for data in masks_png])
-    mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
-    alpha = estimate_alpha_matte(images[centre], mask, plate)
-    _write_frame(images[centre], to_uint8(alpha), out, frame_index)
-
-
-def _decode_mask(mask_png: bytes, size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
-    """Return a mask of the detector at the size (height, width) of the images."""
-    mask = cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
-    return mask if mask.shape == size_px else cv2.resize(mask, size_px[::-1], interpolation=cv2.INTER_LINEAR)

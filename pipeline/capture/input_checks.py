@@ -24,7 +24,7 @@ _MAX_UNSEEN_ARC_DEG = 120.0
 _TARGET_PERSON_HEIGHT_PX = 640.0
 # Detection of a moving camera: number of images, fraction of them that must differ, and margin around the person
 # (fraction of the longer side) that excludes shadows and errors of the mask.
-_N_SCENE_FRAMES, _MAX_MOVED_FRACTION, _PERSON_MARGIN_FRACTION = 32, 0.1, 0.03
+_N_SCENE_FRAMES, MAX_MOVED_FRACTION, _PERSON_MARGIN_FRACTION = 32, 0.1, 0.03
 
 
 def check_frames_that_differ(n_different: int, n_frames: int, path: Path, min_frames: int) -> None:
@@ -124,7 +124,7 @@ def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> d
             f"pictures that are kept; --set frames.max_side_px={side_px} keeps more detail"
         )
     frame_index, differs = sample_scene_changes(detections)
-    if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
+    if differs.sum() > MAX_MOVED_FRACTION * len(differs):
         warn(
             f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
             "the camera or the light seems to change, which causes errors of motion and colour; film again with a "
@@ -158,11 +158,14 @@ def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], 
     """
     found = np.flatnonzero(detections.found)
     sampled = found[evenly_spaced(len(found), _N_SCENE_FRAMES)]
-    margin_px = round(_PERSON_MARGIN_FRACTION * max(detections.gray_thumbnails.shape[1:]))
-    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
-    dilated_masks = np.stack(
-        [cv2.dilate(person.astype(np.uint8), kernel) > 0 for person in detections.person_masks[sampled]]
-    )
     return detections.frame_index[sampled], detect_scene_changes(
-        detections.gray_thumbnails[sampled][..., None].repeat(3, axis=-1), dilated_masks
+        detections.gray_thumbnails[sampled][..., None].repeat(3, axis=-1),
+        dilated_person_masks(detections.person_masks[sampled]),
     )
+
+
+def dilated_person_masks(person_masks: Bool[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n h w"]:
+    """Return the masks with a margin that holds shadows and errors of the mask."""
+    margin_px = round(_PERSON_MARGIN_FRACTION * max(person_masks.shape[1:]))
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    return np.stack([cv2.dilate(person.astype(np.uint8), kernel) > 0 for person in person_masks])

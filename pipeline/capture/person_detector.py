@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -84,8 +85,9 @@ node {
 }
 """
 _LANDMARK_MODEL_OPTIONS = {"model_complexity": 1, "enable_segmentation": True}
-# The ROI grows by 10 to 20 % per iteration.
-_MAX_ROI_ITERATIONS = 3
+# The ROI of the first model often ends at the thighs, where the second one may see a whole person; from there on it
+# grows by 10 to 20 % per iteration.
+_FIRST_ROI_GROWTH, _MAX_ROI_ITERATIONS = 1.25, 3
 # An ROI is too small if the ROI of the landmarks is larger by this ratio, even if the mask does not touch its border
 # (a mask without feet).
 _MAX_ROI_GROWTH = 1.1
@@ -169,15 +171,23 @@ class PersonDetector:
     def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any = None) -> list[_RoiEstimate]:
         """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks.
 
-        square: the ROI to begin with; None: that of the first model.
+        square: the ROI to begin with; None: that of the first model, enlarged.
         """
-        square = self._roi_graph.process(rgb).square if square is None else square
+        square = self._find_first_roi(rgb) if square is None else square
         previous, current = None, self._estimate_in_roi(rgb, square)
         for _ in range(_MAX_ROI_ITERATIONS):
             if current is None or (previous is not None and not is_roi_too_small(previous)):
                 break
             previous, current = current, self._estimate_in_roi(rgb, current.next_square)
         return [estimate for estimate in (previous, current) if estimate is not None]
+
+    def _find_first_roi(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Any:
+        """Return the ROI of the first model, enlarged; None without a person."""
+        square = deepcopy(self._roi_graph.process(rgb).square)
+        if square is not None:
+            square.width *= _FIRST_ROI_GROWTH
+            square.height *= _FIRST_ROI_GROWTH
+        return square
 
     def _estimate_in_roi(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any) -> _RoiEstimate | None:
         """Return the prediction of the second model in an ROI; None without an ROI or a person."""

@@ -5,8 +5,9 @@ import pytest
 
 from pipeline.capture import detection as sightings
 from pipeline.capture.capture import image_path, mask_path
-from pipeline.capture.detection import _temporal_windows, detect_in_frames, write_frames
+from pipeline.capture.detection import detect_in_frames
 from pipeline.capture.face_detector import undetected_face
+from pipeline.capture.frame_writing import _temporal_windows, write_frames
 from pipeline.capture.hand_detector import undetected_hands
 from pipeline.capture.person_detector import PersonDetection
 from pipeline.capture.user_files import load_user_files

@@ -105,7 +105,7 @@ MOTION_ROWS = (
     ),
     Row(
         name="moving-camera",
-        failure="a hand-held camera that drifts by 2-16 px of 288",
+        failure="a hand-held camera that turns its picture by 2-16 px of 288",
         line="at most 1 dB and 1 mm below the same capture on a stand, or a warning that names it",
         trials=tuple(
             turn_trial(f"{px} px", px, corruption={"hand_held_px": px} if px else {}) for px in (0, 2, 4, 8, 16)

@@ -19,6 +19,7 @@ from data_tools.folder import atomic_folder
 from data_tools.synthetic.rig.subject import Subject, save_subject
 from data_tools.synthetic.scene.backdrop import Room, contact_shadow
 from data_tools.synthetic.scene.ball import Ball
+from data_tools.synthetic.scene.hand_held import hand_held_angles_rad, turn_picture
 from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
 from pipeline.body.body import Body, Motion, canonical_to_world
@@ -41,6 +42,8 @@ class SyntheticCapture:
     Attributes:
         ground_m: point on the floor where the person stands (world).
         samples: antialiasing samples per pixel and axis.
+        hand_held_rad: by how much the camera turns while it films. The ground truth, masks included, is that of a
+            camera that stands still.
     """
 
     subject: Subject
@@ -52,6 +55,7 @@ class SyntheticCapture:
     fps: float
     samples: int
     ball: Ball | None = None
+    hand_held_rad: float = 0.0
 
     @cached_property
     def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
@@ -170,10 +174,12 @@ def write_capture(
 
 def _frames(capture: SyntheticCapture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the images in order and write the mask of each."""
-    for frame_index in track(range(len(capture.motion.frame_index)), "rendering"):
+    count = len(capture.motion.frame_index)
+    angles_rad = hand_held_angles_rad(count, capture.fps, capture.hand_held_rad)
+    for frame_index in track(range(count), "rendering"):
         image, coverage = capture.render_frame(frame_index)
         write_gray(masks / f"{frame_index:06d}.png", coverage)
-        yield image
+        yield turn_picture(image, capture.camera.fx, angles_rad[frame_index]) if capture.hand_held_rad else image
 
 
 def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, settings: dict[str, object]) -> None:

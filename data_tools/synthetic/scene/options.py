@@ -50,6 +50,12 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         "--roll-deg", type=float, default=0.0, help="clockwise roll of the camera about its optical axis, degrees"
     )
     parser.add_argument(
+        "--hand-held-deg",
+        type=float,
+        default=0.0,
+        help="angle by which a camera in the hand turns to both sides, degrees",
+    )
+    parser.add_argument(
         "--lean-deg",
         type=float,
         default=0.0,
@@ -106,6 +112,7 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("fill", MIN_FILL, MAX_FILL),
         ("pitch_deg", -45.0, 45.0),
         ("roll_deg", -45.0, 45.0),
+        ("hand_held_deg", 0.0, 10.0),
         ("lean_deg", -30.0, 60.0),
         ("lower_arms_deg", 0.0, 60.0),
         ("close_legs_deg", 0.0, 20.0),
@@ -194,7 +201,18 @@ def build_capture(
     light = LIGHTING_PRESETS[options.light]
     if options.specular is not None:
         light = replace(light, specular_strength=options.specular)
-    capture = SyntheticCapture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
+    capture = SyntheticCapture(
+        subject,
+        motion,
+        camera,
+        light,
+        room,
+        ground_m,
+        options.fps,
+        options.samples,
+        ball,
+        float(np.radians(options.hand_held_deg)),
+    )
     # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
     person_position_m = ground_m + start_offset_m * [1.0, 0.0, 1.0]

@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Num, UInt8
 
 # Minimum number of images that show a pixel without the person.
 _MIN_OBSERVATIONS = 3
-# Where the halves of what was seen start whose width is compared, and that width for a normal distribution.
-_HALF_STARTS, _DEVIATIONS_OF_HALF = (0.0, 0.125, 0.25, 0.375, 0.5), 1.35
+# Parts of what was seen at whose ends halves begin and end whose width is compared, and that width for a normal
+# distribution.
+_PARTS, _DEVIATIONS_OF_HALF = 8, 1.35
 # Maximum difference from the plate caused by video noise and compression: levels of 255, and standard deviations.
 _MAX_PLATE_DIFFERENCE_LEVELS, _MAX_PLATE_DEVIATIONS = 15.0, 2.0
 # Smallest share of the difference inside at which a pixel of the rim is covered as much: less may be a halo of
@@ -65,9 +66,10 @@ def estimate_background_plate(
         index = np.floor(share * last).astype(np.intp)
         return np.take_along_axis(images, index[None, ..., None], axis=0)[0]
 
-    halves = [largest_difference(quantile(start), quantile(start + 0.5)) for start in _HALF_STARTS]
+    quantiles, half = [quantile(part / _PARTS) for part in range(_PARTS + 1)], _PARTS // 2
+    halves = [largest_difference(*ends) for ends in zip(quantiles, quantiles[half:], strict=False)]
     deviation = (reduce(np.minimum, halves) / _DEVIATIONS_OF_HALF).astype(np.uint8)
-    return BackgroundPlate(quantile(0.5), count >= _MIN_OBSERVATIONS, deviation)
+    return BackgroundPlate(quantiles[half], count >= _MIN_OBSERVATIONS, deviation)
 
 
 class PlateComparison(NamedTuple):

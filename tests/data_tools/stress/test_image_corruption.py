@@ -16,7 +16,6 @@ from data_tools.stress.image_corruption import (
     expose,
     flicker_gains,
     interpolate_pose,
-    shift_smoothly,
 )
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.movie import LOSSLESS, write_video
@@ -63,19 +62,6 @@ def test_noise_of_a_sensor_has_the_standard_deviation_of_its_light() -> None:
     light = gain * linear(120)
     assert noisy.mean() == pytest.approx(light, rel=0.01)
     assert noisy.std() == pytest.approx(np.sqrt(READ_NOISE**2 + SHOT_NOISE**2 * light), rel=0.05)
-
-
-def test_a_shift_moves_a_dot_and_is_at_most_its_amplitude() -> None:
-    image = np.zeros((64, 64, 3), np.uint8)
-    image[30:35, 30:35] = 200
-    shifted = shift_smoothly([image] * 40, 6.0)
-    rows, columns = np.mgrid[:64, :64]
-    centres = np.array(
-        [[(rows * i[..., 0]).sum() / i[..., 0].sum(), (columns * i[..., 0]).sum() / i[..., 0].sum()] for i in shifted]
-    )
-    offsets = np.abs(centres - 32.0).max(axis=0)
-    assert (offsets <= 6.05).all()
-    assert (offsets > 3.0).all()
 
 
 def test_a_cut_removes_rows_at_the_bottom(capture: SyntheticCapture) -> None:
