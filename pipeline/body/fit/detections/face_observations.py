@@ -20,6 +20,10 @@ MIN_FACING_COSINE = 0.6
 MAX_DISTANCE_M = 0.06
 """Largest mean distance from the same landmarks of the pose; a face farther away is another one, or none."""
 
+MIN_POSE_FACING_COSINE = -0.2
+"""The same of the head of the pose, which knows front from back: the face detector finds faces in the hair of a head
+that is seen from behind."""
+
 _OUTER_EYES, _BRIDGE_AND_CHIN = (263, 33), (168, 152)
 _SAME_POINTS = (
     (263, PoseLandmark.LEFT_EYE_OUTER),
@@ -40,7 +44,11 @@ def face_landmarks(
     faces_px: pixels and depth in pixels (`pipeline.capture.face_detector`), nan without a face.
     pose_px, pose_world_m: landmarks of the pose, the latter relative to the hips.
     """
-    reliable = _is_near_pose(faces_px, pose_px, pose_world_m) & (facing_cosine(faces_px) >= MIN_FACING_COSINE)
+    reliable = (
+        _is_near_pose(faces_px, pose_px, pose_world_m)
+        & (facing_cosine(faces_px) >= MIN_FACING_COSINE)
+        & (_pose_facing_cosine(pose_world_m) >= MIN_POSE_FACING_COSINE)
+    )
     points_px = faces_px[:, FACE_MESH_POINTS, :2]
     return points_px, np.repeat(reliable[:, None].astype(np.float64), len(FACE_MESH_POINTS), axis=1)
 
@@ -56,6 +64,13 @@ def facing_cosine(faces_px: Float[np.ndarray, "*n 478 3"]) -> Float[np.ndarray, 
     # Pixel axes: x right, y down, z away. A face that looks at the camera has its left side at larger x.
     forward = np.cross(down, across)
     return -forward[..., 2] / np.linalg.norm(forward, axis=-1)
+
+
+def _pose_facing_cosine(pose_world_m: Float[np.ndarray, "n 33 3"]) -> Float[np.ndarray, "n"]:
+    """Return the cosine of the angle between the direction from ears to nose and the direction to the camera."""
+    ears_m = pose_world_m[:, [PoseLandmark.LEFT_EAR, PoseLandmark.RIGHT_EAR]].mean(axis=1)
+    forward = pose_world_m[:, PoseLandmark.NOSE] - ears_m
+    return -forward[:, 2] / np.linalg.norm(forward, axis=1)
 
 
 def _is_near_pose(

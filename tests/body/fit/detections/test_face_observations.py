@@ -62,6 +62,18 @@ def test_a_face_away_from_that_of_the_pose_is_not_reliable() -> None:
     assert not confidence.any()
 
 
+def test_a_face_that_is_found_on_the_back_of_a_head_is_not_reliable() -> None:
+    """Its eyes are where those of the pose are, but for left and right: within the distance that is allowed."""
+    scene = synthetic_recording(load_anny(), 24, turn_rad=2.0 * np.pi)
+    expected = head_facing_cosine(scene)
+    front = int(np.argmax(expected))
+    middle_px = scene.landmarks_px[:, 1:11].mean(axis=1)
+    faces_px = scene.faces_px[front] + np.pad(middle_px - middle_px[front], ((0, 0), (0, 1)))[:, None]
+    _, confidence = face_landmarks(faces_px, scene.landmarks_px, scene.landmarks_world_m)
+    assert (confidence[expected > 0.9] == 1.0).all()
+    assert (confidence[expected < -0.3] == 0.0).all()
+
+
 def test_points_are_in_the_order_of_the_landmarks() -> None:
     indices = [index for landmark in LANDMARKS for index in landmark.indices if index >= FACE_MESH_START]
     assert indices == list(range(FACE_MESH_START, FACE_MESH_START + len(FACE_MESH_POINTS)))
