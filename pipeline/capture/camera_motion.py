@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.capture.detection import Detections
+from pipeline.capture.detection import Detections, decode_mask, encode_mask
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.input_checks import MAX_MOVED_FRACTION, dilated_person_masks, sample_scene_changes
 from pipeline.core.progress import track
@@ -306,9 +306,9 @@ def _warp_png(mask_png: bytes, homography: Float[np.ndarray, "3 3"], width_px: i
     """Warp an encoded mask, which may be smaller than the picture; empty if it is."""
     if not mask_png:
         return mask_png
-    mask = cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    mask = decode_mask(mask_png)
     stabilised = warp_image(mask, rescaled(homography, mask.shape[1] / width_px), is_mask=True)
-    return cv2.imencode(".png", stabilised, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+    return encode_mask(stabilised)
 
 
 def _is_cut_off(

@@ -172,6 +172,16 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
 
 
+def encode_mask(mask: UInt8[np.ndarray, "h w"]) -> bytes:
+    """Return a mask as an entry of `Detections.masks_png`."""
+    return cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+
+
+def decode_mask(mask_png: bytes) -> UInt8[np.ndarray, "h w"]:
+    """Return the mask of an entry of `Detections.masks_png` that is not empty."""
+    return cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
 class _Detectors:
     """Detectors for one thread at a time, each loaded when it is first used; that of the person takes a second."""
 
@@ -256,7 +266,7 @@ def _complete_detection(
         face_px = detectors.face.detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
     if mask is None and detection is not None:
         mask = detection.mask
-        mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+        mask_png = encode_mask(mask)
     if mask is None:
         return _FrameDetection(gray, np.zeros(gray.shape, dtype=bool), None, b"", n_people)
     person = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > _MIN_PERSON_LEVEL

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from pipeline.capture.camera_motion import warp_image
 from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
-from pipeline.capture.detection import Detections, read_undistorted_frames, read_user_mask
+from pipeline.capture.detection import Detections, decode_mask, read_undistorted_frames, read_user_mask
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.masks.background_plate import BackgroundPlate, estimate_background_plate
 from pipeline.capture.masks.matting import (
@@ -85,7 +85,7 @@ def estimate_background(
     frames = read_stabilised_frames(source, user_files, detections, is_taken, max_side_px)
     for image, frame in zip(images, frames, strict=True):
         image[:] = frame.rgb
-    masks = [~definite_background(_decode_mask(detections.masks_png[p], size_px)) for p in sampled]
+    masks = [~definite_background(_mask_of_size(detections.masks_png[p], size_px)) for p in sampled]
     return estimate_background_plate(images, np.stack(masks))
 
 
@@ -144,13 +144,13 @@ def _write_matted_frame(
 ) -> None:
     """Compute and write the matte of one frame (runs in a worker thread)."""
     height, width = images.shape[1:3]
-    masks = np.stack([_decode_mask(data, (height, width)) for data in masks_png])
+    masks = np.stack([_mask_of_size(data, (height, width)) for data in masks_png])
     mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
     alpha = estimate_alpha_matte(images[centre], mask, plate)
     _write_frame(images[centre], to_uint8(alpha), out, frame_index)
 
 
-def _decode_mask(mask_png: bytes, size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+def _mask_of_size(mask_png: bytes, size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
     """Return a mask of the detector at the size (height, width) of the images."""
-    mask = cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    mask = decode_mask(mask_png)
     return mask if mask.shape == size_px else cv2.resize(mask, size_px[::-1], interpolation=cv2.INTER_LINEAR)
