@@ -24,13 +24,13 @@ from jaxtyping import Float
 import stages
 from data_tools.command import run_command
 from data_tools.evaluate.comparison import MatchedRigs
-from data_tools.evaluate.truth import load_ground_truth
+from data_tools.evaluate.truth import load_ground_truth, read_capture_settings
 from data_tools.folder import atomic_folder
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
-from pipeline.core.manifest import digest_json
+from pipeline.core.manifest import digest_json, digest_video
 from pipeline.core.parent import die_with_parent_environment
 from pipeline.core.record import RunRecord, read_record, write_record
 from pipeline.core.stage import StagePlan, plan_stage, run_stage
@@ -47,10 +47,7 @@ def main(argv: Sequence[str]) -> None:
     options = _parse(argv)
     run_dir: Path = options.run
     supplied = run_dir.with_name(f"{run_dir.name}-true_input")
-    if not supplied.exists():
-        write_true_input(options.capture, supplied)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    write_record(RunRecord(str((supplied / "video").resolve()), options.preset), run_dir)
+    prepare_run(options.capture, supplied, run_dir, options.preset)
     for name in stages.STAGES:
         if name == BODY:
             with run_lock(run_dir):
@@ -59,6 +56,25 @@ def main(argv: Sequence[str]) -> None:
         command = [sys.executable, "-m", "stages", name, str(run_dir)]
         if subprocess.run(command, env=die_with_parent_environment(), check=False).returncode != 0:
             raise UserError(f"stage {name} of {run_dir} failed; repair its cause and run the same command again")
+
+
+def prepare_run(capture: Path, supplied: Path, run_dir: Path, preset: str) -> None:
+    """Make the capture with the true input, unless it exists, and record it as the video of a run.
+
+    Raises:
+        UserError: the capture has no ground truth, `supplied` is of another capture, or the run is of another video.
+    """
+    read_capture_settings(capture)
+    video, known = (supplied / "video").resolve(), read_record(run_dir).video_path
+    if known not in (None, video):
+        raise UserError(f"{run_dir} belongs to the video {known}: name another run folder")
+    if not supplied.exists():
+        write_true_input(capture, supplied)
+    elif digest_video(supplied / "truth") != digest_video(capture / "truth"):
+        raise UserError(f"{supplied} is not of the capture {capture}: remove it, or name another run folder")
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with run_lock(run_dir):
+        write_record(RunRecord(str(video), preset), run_dir)
 
 
 def write_true_input(capture: Path, folder: Path) -> None:

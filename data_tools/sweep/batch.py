@@ -31,6 +31,7 @@ from data_tools.templates import render_template
 from pipeline.capture.video import VIDEO_SUFFIXES
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import list_files
 from pipeline.core.progress import track
 from pipeline.core.run_folder import default_run_dir
 from pipeline.core.status import FRESH
@@ -82,7 +83,7 @@ def find_videos(folder: Path) -> dict[str, Path]:
 
 def newest_mtime_ns(video: Path) -> int:
     """Return the modification time of a video, in ns since the epoch; of a folder, that of its newest file."""
-    files = [video] if video.is_file() else [path for path in video.rglob("*") if path.is_file()]
+    files = [video] if video.is_file() else [video / name for name in list_files(video)]
     return max((path.stat().st_mtime_ns for path in files), default=0)
 
 

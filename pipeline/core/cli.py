@@ -17,7 +17,7 @@ from pipeline.core.pipeline import Pipeline
 from pipeline.core.preparation import prepare_machine
 from pipeline.core.record import read_record
 from pipeline.core.run_folder import RunRequest, StageFailedError, default_run_dir, open_run, require_run
-from pipeline.core.runner import EXIT_INTERRUPTED, RunOptions, format_summary, run_pipeline
+from pipeline.core.runner import EXIT_INTERRUPTED, HOW_TO_RESUME, RunOptions, format_summary, run_pipeline
 from pipeline.core.stage import Stage, plan_stage, run_stage
 from pipeline.core.status import format_status, verify_artifacts
 
@@ -26,7 +26,7 @@ def main(stage: Stage, argv: Sequence[str] | None = None, config_dir: Path = CON
     """Run the command of one stage, `python -m stages.NAME RUN`; return the exit status."""
     die_with_parent()
     arguments = sys.argv[1:] if argv is None else argv
-    return _run_with_exit_status(lambda: _run_single_stage(stage, arguments, config_dir))
+    return _run_with_exit_status(lambda: _run_single_stage(stage, arguments, config_dir), arguments)
 
 
 def main_pipeline(
@@ -44,9 +44,9 @@ def main_pipeline(
     if arguments and arguments[0] in pipeline.names:
         stage_name = arguments[0]
         return _run_with_exit_status(
-            lambda: _run_single_stage(pipeline.load_stage(stage_name), arguments[1:], pipeline.config_dir)
+            lambda: _run_single_stage(pipeline.load_stage(stage_name), arguments[1:], pipeline.config_dir), arguments
         )
-    return _run_with_exit_status(lambda: _run_pipeline(pipeline, arguments, version, isolate))
+    return _run_with_exit_status(lambda: _run_pipeline(pipeline, arguments, version, isolate), arguments)
 
 
 def _run_single_stage(stage: Stage, argv: Sequence[str], config_dir: Path) -> None:
@@ -206,8 +206,11 @@ class _Parser(argparse.ArgumentParser):
         raise UserError(f"{message}: see {self.prog} --help")
 
 
-def _run_with_exit_status(work: Callable[[], None]) -> int:
-    """Call `work` and print user errors in one sentence; faults of the program keep their traceback."""
+def _run_with_exit_status(work: Callable[[], None], arguments: Sequence[str]) -> int:
+    """Call `work` and print user errors in one sentence; faults of the program keep their traceback.
+
+    arguments: of the command.
+    """
     try:
         work()
     except UserError as error:
@@ -223,7 +226,8 @@ def _run_with_exit_status(work: Callable[[], None]) -> int:
         return _report_error(sentence)
     except KeyboardInterrupt:
         if not is_runner_child():
-            print("interrupted: run the same command again to resume", file=sys.stderr)
+            is_forced = any(argument.partition("=")[0] in ("--force", "--from") for argument in arguments)
+            print(f"interrupted: {HOW_TO_RESUME[is_forced]}", file=sys.stderr)
         return EXIT_INTERRUPTED
     return 0
 

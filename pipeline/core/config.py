@@ -5,6 +5,7 @@ Later layers override earlier ones: `configs/default.yaml`, the file of the pres
 """
 
 import difflib
+import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, is_dataclass
@@ -22,9 +23,14 @@ CONFIG_DIR = Path(str(resources.files("configs")))
 BASELINE_PRESETS = Path("data_tools", "baselines")
 """Folder of the presets that reproduce published methods, relative to the parent folder of the product's presets."""
 PRESET_SUFFIXES = (".yaml", ".yml")
+FILE_OPTION_SUFFIX = "_file"
+"""End of the names of options that are paths of files."""
 
 _TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 _YAML_WIDTH = 10_000
+_YAML_BOOL, _YAML_DATE = "tag:yaml.org,2002:bool", "tag:yaml.org,2002:timestamp"
+_YAML_MARKUP = ("[", "{", "'", '"', "!", "&", "*")
+"""First characters of a value on the command line that is more than unquoted text."""
 _YAML_SCALAR_END = "...\n"
 _HEADING = "# Defaults of all stages. `make configs` writes this file from the code; a test compares the two."
 
@@ -35,7 +41,9 @@ class Config(BaseModel):
     Each field is a `pydantic.Field` with its bounds and a description that names the unit.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, coerce_numbers_to_str=True
+    )
 
 
 ConfigType = TypeVar("ConfigType", bound=Config)
@@ -109,6 +117,8 @@ def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
 def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
     """Convert `["mesh.max_faces=30000"]` to `{"mesh.max_faces": 30000}`; the values are YAML.
 
+    Text needs no quotes, whatever characters are in it.
+
     Raises:
         UserError: an assignment does not have the form section.key=value.
     """
@@ -118,7 +128,7 @@ def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
         parts = key.split(".")
         if not equals or len(parts) < 2 or not all(parts):
             raise UserError(f"--set {assignment} is not valid: write --set section.key=value")
-        overrides[key] = _parse_yaml(text, f"--set {assignment}")
+        overrides[key] = _parse_value(text.strip(), f"--set {assignment}")
     return overrides
 
 
@@ -168,6 +178,17 @@ def _read_sections(path: Path) -> dict[str, Any]:
     return {name: values or {} for name, values in sections.items()}
 
 
+def _parse_value(text: str, origin: str) -> Any:
+    """Parse the value of an assignment: what is neither quoted nor in brackets is one number, true, null or text."""
+    if text.startswith(_YAML_MARKUP):
+        return _parse_yaml(text, origin)
+    try:
+        value = yaml.load(text, _Loader)  # noqa: S506 - a safe loader
+    except (yaml.YAMLError, ValueError):
+        return text
+    return text if isinstance(value, str | dict | list) else value
+
+
 def _parse_yaml(text: str, origin: str) -> Any:
     try:
         return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
@@ -177,7 +198,10 @@ def _parse_yaml(text: str, origin: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader without aliases: lists that share their parts have more items than fit into memory."""
+    """The safe loader without aliases: lists that share their parts have more items than fit into memory.
+
+    As in YAML 1.2, only true and false are logical values (off and no are text), and a date is text.
+    """
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """Compose a node; YAMLError for an alias."""
@@ -185,6 +209,13 @@ class _Loader(yaml.SafeLoader):
             raise yaml.YAMLError("aliases (*name) are not read: write the value again")
         node: yaml.Node | None = super().compose_node(parent, index)
         return node
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_YAML_BOOL, _YAML_DATE)]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(_YAML_BOOL, re.compile("^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
 
 
 def _merge(target: dict[str, Any], values: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """Record of a run in `run.json`: its video, preset and overrides, which later commands reuse."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 
 from pipeline.core.atomic import atomic_path
 from pipeline.core.command import format_command
-from pipeline.core.config import PRESET_SUFFIXES
+from pipeline.core.config import FILE_OPTION_SUFFIX, PRESET_SUFFIXES
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.core.manifest import digest_video, read_manifest
@@ -74,7 +75,17 @@ def update_record(
     if preset is not None:
         is_file = preset.endswith(PRESET_SUFFIXES)
         record = replace(record, preset=str(Path(preset).resolve()) if is_file else preset, overrides={})
-    return replace(record, overrides={**record.overrides, **overrides})
+    given = {key: _recorded_value(key, value) for key, value in overrides.items()}
+    return replace(record, overrides={**record.overrides, **given})
+
+
+def _recorded_value(key: str, value: Any) -> Any:
+    """Return the value of an option as JSON can hold it; the path of a file (`..._file`) is made absolute."""
+    if hasattr(value, "tolist"):  # a number or an array of NumPy
+        value = value.tolist()
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    return str(Path(value).resolve()) if key.endswith(FILE_OPTION_SUFFIX) and isinstance(value, str) else value
 
 
 def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video: bool) -> Path:

@@ -26,6 +26,11 @@ from pipeline.core.run_folder import RunRequest, StageFailedError, StageKilledEr
 from pipeline.core.stage import StagePlan, discard_work_dir, plan_stage, run_stage
 
 EXIT_INTERRUPTED = 130
+HOW_TO_RESUME = {
+    False: "run the same command again to resume",
+    True: "the same command starts over, because of --force or --from; without it, earlier results stay as they are",
+}
+"""What a user can do after an interruption, by whether results were to be made again."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +197,7 @@ class _StageRunner:
         if code < 0:
             raise StageKilledError(
                 f"stage {name} was killed by signal {-code} (9 often means that memory ran out): "
-                "run the same command again to resume"
+                f"{HOW_TO_RESUME[name in self.options.forced]}"
             )
         if code == EXIT_INTERRUPTED:
             raise KeyboardInterrupt

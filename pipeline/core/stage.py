@@ -15,7 +15,7 @@ from typing import Any
 
 from pipeline.core.atomic import atomic_path, fsync_path
 from pipeline.core.command import format_command
-from pipeline.core.config import Config
+from pipeline.core.config import FILE_OPTION_SUFFIX, Config
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
     MANIFEST_FILE,
@@ -24,6 +24,7 @@ from pipeline.core.manifest import (
     digest_files,
     digest_video,
     fingerprint,
+    list_files,
     read_manifest,
     write_manifest,
 )
@@ -33,6 +34,8 @@ from pipeline.core.progress import take_warnings
 VIDEO = "video"
 FINGERPRINT = ".fingerprint"
 CHECKPOINT_PREFIX = "checkpoint"
+MARKS = (MANIFEST_FILE, FINGERPRINT)
+"""Files of which a folder that a stage made has at least one."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,11 @@ class StagePlan:
         """Folder of unfinished work."""
         return self.run_dir / f"{self.stage.name}.part"
 
+    @property
+    def previous(self) -> Path:
+        """Folder of the artifacts that are being replaced."""
+        return self.run_dir / f"{self.stage.name}.old"
+
     def is_fresh(self) -> bool:
         """Return True if the folder holds the result of this fingerprint and no file is missing."""
         manifest = read_manifest(self.folder)
@@ -116,7 +124,7 @@ def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) 
 
 def _digests_of_named_files(config: Config) -> dict[str, str]:
     """Return the digests of the files that options ending in `_file` name; the stage reports one that is missing."""
-    paths = {name: Path(value) for name, value in config if name.endswith("_file") and value is not None}
+    paths = {name: Path(value) for name, value in config if name.endswith(FILE_OPTION_SUFFIX) and value is not None}
     return {name: digest_file(path) for name, path in paths.items() if path.is_file()}
 
 
@@ -130,17 +138,18 @@ def run_stage(plan: StagePlan, force: bool = False) -> bool:
         force: run even if the result is fresh, from the beginning.
 
     Raises:
-        UserError, OSError, MemoryError: from the stage.
+        UserError, OSError, MemoryError: from the stage; UserError if a folder of its name was not made by a stage.
         RuntimeError: the stage did not make a declared output (a fault of its code).
     """
-    previous = plan.run_dir / f"{plan.stage.name}.old"
-    _remove(previous)
+    for folder in (plan.folder, plan.previous, plan.work_dir):
+        _require_made(folder)
+    _retire_previous(plan)
     if plan.is_fresh() and not force:
         discard_work_dir(plan)
         return False
     try:
         _execute(plan, force)
-        _publish(plan, previous)
+        _publish(plan)
     except (UserError, OSError, MemoryError):
         discard_work_dir(plan)
         raise
@@ -149,7 +158,7 @@ def run_stage(plan: StagePlan, force: bool = False) -> bool:
 
 def discard_work_dir(plan: StagePlan) -> None:
     """Remove unfinished work, if it exists."""
-    _remove(plan.work_dir)
+    _remove_made(plan.work_dir)
 
 
 def _execute(plan: StagePlan, force: bool) -> None:
@@ -186,7 +195,7 @@ def _prepare_work_dir(plan: StagePlan, force: bool) -> bool:
     fingerprint_path = plan.work_dir / FINGERPRINT
     is_same_fingerprint = not force and fingerprint_path.is_file() and fingerprint_path.read_text() == plan.fingerprint
     if not is_same_fingerprint:
-        _remove(plan.work_dir)
+        _remove_made(plan.work_dir)
         plan.work_dir.mkdir(parents=True)
         fingerprint_path.write_text(plan.fingerprint)
     kept = False
@@ -206,16 +215,44 @@ def _check_outputs(plan: StagePlan) -> None:
             raise RuntimeError(f"stage {plan.stage.name} did not make {declared}")
 
 
-def _publish(plan: StagePlan, previous: Path) -> None:
+def _publish(plan: StagePlan) -> None:
     """Remove the working files and rename the work folder; the result that it replaces is removed last."""
     for path in list(plan.work_dir.iterdir()):
         if _is_working_file(path.name):
             _remove(path)
     if plan.folder.exists():
-        plan.folder.rename(previous)
+        plan.folder.rename(plan.previous)
     plan.work_dir.rename(plan.folder)
     fsync_path(plan.run_dir)
-    _remove(previous)
+    _retire_previous(plan)
+
+
+def _retire_previous(plan: StagePlan) -> None:
+    """Remove the result that was replaced; the user's files in it, such as a scene made of it, move to the new one."""
+    manifest = read_manifest(plan.previous)
+    if manifest is not None and plan.folder.is_dir():
+        for name in list_files(plan.previous):
+            if name not in manifest.outputs and name != MANIFEST_FILE and not (plan.folder / name).exists():
+                (plan.folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (plan.previous / name).rename(plan.folder / name)
+    _remove_made(plan.previous)
+
+
+def _require_made(folder: Path) -> None:
+    """Raise UserError if something that no stage made is where a stage would replace it."""
+    if not folder.exists() or any((folder / mark).is_file() for mark in MARKS):
+        return
+    if not folder.is_dir() or any(folder.iterdir()):
+        raise UserError(f"{folder} was not made by this program and would be replaced: move it, or choose another run")
+
+
+def _remove_made(folder: Path) -> None:
+    """Delete a folder that a stage made, if it exists; what tells that a stage made it goes last, in case of a kill."""
+    if folder.is_dir() and not folder.is_symlink():
+        for path in list(folder.iterdir()):
+            if path.name not in MARKS:
+                _remove(path)
+    _remove(folder)
 
 
 def _is_working_file(name: str) -> bool:

@@ -1,6 +1,7 @@
 """PSNR of the validation frames over the training time."""
 
 import csv
+import shutil
 from pathlib import Path
 
 from pipeline.core.manifest import PROGRESS_FILE
@@ -11,7 +12,7 @@ MEAN_COLUMNS = ("step", "seconds", "validation_psnr_db", "validation_psnr_body_d
 class ValidationCurve:
     """Table of `MEAN_COLUMNS` and the PSNR of each validation frame (dB), one row per measurement.
 
-    It is kept as a checkpoint file during the training, and becomes `progress.csv` at the end.
+    It is kept as a checkpoint file, of which `progress.csv` is a copy at the end.
     """
 
     def __init__(self, out: Path, completed_steps: int) -> None:
@@ -31,6 +32,6 @@ class ValidationCurve:
             csv.writer(file).writerows([(*MEAN_COLUMNS, *(f"frame_{frame}_db" for frame in frames)), *self.rows])
 
     def finish(self) -> None:
-        """Rename the checkpoint file to `progress.csv`, if there are rows."""
+        """Write `progress.csv`, if there are rows; the checkpoint file stays, for a stage that is killed after this."""
         if self.rows:
-            self.checkpoint_path.replace(self.output_path)
+            shutil.copyfile(self.checkpoint_path, self.output_path)

@@ -13,9 +13,7 @@ import pytest
 
 from pipeline.core.cli import main_pipeline
 from pipeline.core.command import COMMAND_VARIABLE
-from pipeline.core.errors import UserError
 from pipeline.core.measure import REPOSITORY_DIR
-from pipeline.core.run_folder import default_run_dir
 from tests.core.toy.stages import PIPELINE
 from tests.core.toy_pipeline import Toy, user_environment
 
@@ -349,14 +347,13 @@ def test_a_folder_of_the_user_does_not_hide_the_stages(toy: Toy) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_run_is_named_after_the_video(tmp_path: Path) -> None:
-    (tmp_path / "ann").mkdir()
-    (tmp_path / "ann" / "video.mp4").touch()
-    (tmp_path / "ann" / "walk.mp4").touch()
-    named = [default_run_dir(tmp_path / "ann" / name) for name in ("video.mp4", "walk.mp4", "")]
-    assert named == [Path("runs/ann"), Path("runs/walk"), Path("runs/ann")]
-    with pytest.raises(UserError, match="python -m stages VIDEO"):
-        default_run_dir(None)
+def test_an_interrupted_force_is_not_said_to_resume(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    process = toy.start("stages", "--run", "runs/a", "--from=learn", TOY_SLEEP_S="30")
+    wait_for(toy.run_dir / "learn.part" / "checkpoint.json")
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert err.splitlines()[-1].startswith("interrupted: the same command starts over, because of --force or --from")
 
 
 def test_ctrl_c_prints_one_line(toy: Toy) -> None:

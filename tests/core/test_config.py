@@ -174,6 +174,18 @@ def test_default_yaml_reads_back_as_the_defaults() -> None:
     assert "  # cells along the longest side\n  size: 64\n" in text
 
 
+@pytest.mark.parametrize(
+    "text", ["Shot #3, for the museum", "Only for X: ask", "@jane", "off", "2024-01-02", "- a", "%", "a: b: c", "x #"]
+)
+def test_text_needs_no_quotes(text: str) -> None:
+    assert parse_overrides([f"export.author={text}"]) == {"export.author": text}
+    assert parse_overrides([f"export.author='{text}'"]) == {"export.author": text}
+
+
+def test_text_of_digits_is_text(config_dir: Path) -> None:
+    assert built(config_dir, "default", "mesh.name=2024").name == "2024"
+
+
 @given(st.integers(-(10**6), 10**6))
 def test_overrides_keep_whole_numbers(number: int) -> None:
     assert parse_overrides([f"a.b={number}"]) == {"a.b": number}

@@ -18,6 +18,7 @@ from pipeline.core.manifest import (
     digest_video,
     find_damaged_files,
     fingerprint,
+    list_files,
     read_manifest,
     write_manifest,
 )
@@ -69,6 +70,21 @@ def test_a_video_folder_is_identified_by_names_and_contents(tmp_path: Path) -> N
     renamed = digest_video(tmp_path)
     (tmp_path / "1.png").write_bytes(b"abd")
     assert len({before, renamed, digest_video(tmp_path)}) == 3
+
+
+def test_linked_folders_belong_to_a_video(tmp_path: Path) -> None:
+    """Large data sets are linked, also twice; a link to a folder above is not followed."""
+    video, data = tmp_path / "video", tmp_path / "data"
+    video.mkdir()
+    data.mkdir()
+    (data / "0.png").write_bytes(b"abc")
+    for name in ("images", "masks"):
+        (video / name).symlink_to(data)
+    (video / "loop").symlink_to(video)
+    assert list_files(video) == ["images/0.png", "masks/0.png"]
+    before = digest_video(video)
+    (data / "0.png").write_bytes(b"abd")
+    assert digest_video(video) != before
 
 
 def test_a_missing_video_is_a_user_error(tmp_path: Path) -> None:

@@ -162,7 +162,7 @@ def test_checkpoints_of_another_fingerprint_are_dropped(tmp_path: Path, number: 
 
 
 def test_a_kill_just_before_the_rename_costs_no_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(plan: StagePlan, previous: Path) -> None:
+    def die(plan: StagePlan) -> None:
         raise KeyboardInterrupt
 
     def never(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
@@ -174,6 +174,50 @@ def test_a_kill_just_before_the_rename_costs_no_work(tmp_path: Path, monkeypatch
             run_stage(plan(tmp_path))
     assert names(tmp_path) == {"count.part"}
     run_stage(plan(tmp_path, never))
+    assert names(tmp_path) == {"count"}
+
+
+@pytest.mark.parametrize("name", ["count", "count.old", "count.part"])
+def test_what_no_stage_made_is_never_replaced(tmp_path: Path, name: str) -> None:
+    own = tmp_path / "run" / name
+    own.mkdir(parents=True)
+    (own / "IMG_0001.png").write_text("mine")
+    with pytest.raises(UserError, match=f"{name} was not made by this program"):
+        run_stage(plan(tmp_path), force=True)
+    assert (own / "IMG_0001.png").read_text() == "mine"
+    (own / "IMG_0001.png").unlink()
+    assert run_stage(plan(tmp_path))
+
+
+def test_files_of_the_user_in_a_result_outlive_it(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    folder = tmp_path / "run" / "count"
+    (folder / "scenes").mkdir()
+    (folder / "scenes" / "me.blend").write_text("mine")
+    assert run_stage(plan(tmp_path, number=2))
+    assert (folder / "number.txt").read_text() == "2"
+    assert (folder / "scenes" / "me.blend").read_text() == "mine"
+    assert names(tmp_path) == {"count"}
+
+
+def test_a_kill_while_a_result_is_removed_leaves_what_the_next_run_can_remove(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(path: Path) -> None:
+        if not path.exists():
+            return
+        assert path.name == "number.txt"
+        path.unlink()
+        raise KeyboardInterrupt
+
+    run_stage(plan(tmp_path))
+    with monkeypatch.context() as patched:
+        patched.setattr(stage_module, "_remove", die)
+        patched.setattr(stage_module, "_is_working_file", lambda name: False)
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(plan(tmp_path, number=2))
+    assert names(tmp_path) == {"count", "count.old"}
+    run_stage(plan(tmp_path, number=2))
     assert names(tmp_path) == {"count"}
 
 

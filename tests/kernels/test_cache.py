@@ -88,6 +88,9 @@ def test_cache_folder_is_default_or_user_supplied(kernels: Path, tmp_path: Path)
     assert custom_folder == tmp_path / "custom_folder" / default_folder.name
     read_only = f"import os; os.access = lambda *_: False; {CACHE_FOLDER_SCRIPT}"
     assert Path(output(kernels, read_only, XDG_CACHE_HOME=str(tmp_path))).is_relative_to(tmp_path / "numba")
+    homeless = output(kernels, read_only, XDG_CACHE_HOME="/dev/null/none", TMPDIR=str(tmp_path))
+    assert Path(homeless).parent.name.startswith("numba-")
+    assert Path(homeless).is_relative_to(tmp_path)
 
 
 def test_cache_key_covers_all_imported_files(repository: Path) -> None:

@@ -45,6 +45,11 @@ def test_results_keep_job_order(four_threads: None) -> None:
     assert ThreadPool(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
 
 
+@pytest.mark.parametrize("count", [1, 4])
+def test_without_arguments_there_are_no_jobs(four_threads: None, count: int) -> None:
+    assert ThreadPool(count).map(lambda: pytest.fail("there is no job")) == []
+
+
 def test_imap_keeps_the_order_and_holds_few_results(four_threads: None) -> None:
     started = []
 

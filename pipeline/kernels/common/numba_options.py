@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -30,15 +31,26 @@ def cache_folder(sources: Iterable[Path]) -> Path:
 
     numba itself checks only the file of a function for changes, not the files of the functions and constants that are
     compiled into it, and not the flags. The parent folder is NUMBA_CACHE_DIR; without it `__pycache__` next to the
-    sources, or the user's cache folder where the sources are read-only.
+    sources, or where these are read-only the user's cache folder, or a temporary one where there is no home either.
     """
     compiler_flags = f"{config.OPT} {config.LOOP_VECTORIZE} {config.SLP_VECTORIZE}"
     digest = hashlib.sha256(compiler_flags.encode())
     for path in sources:
         digest.update(path.read_bytes())
-    writable = os.access(KERNELS_FOLDER, os.W_OK)
-    default_folder = KERNELS_FOLDER / "__pycache__" if writable else AppDirs("numba", False).user_cache_dir
-    return Path(config.CACHE_DIR or default_folder) / f"kernels-{digest.hexdigest()[:16]}"
+    return _parent_folder() / f"kernels-{digest.hexdigest()[:16]}"
+
+
+def _parent_folder() -> Path:
+    if config.CACHE_DIR:
+        return Path(config.CACHE_DIR)
+    if os.access(KERNELS_FOLDER, os.W_OK):
+        return KERNELS_FOLDER / "__pycache__"
+    of_user = Path(AppDirs("numba", False).user_cache_dir)
+    try:
+        of_user.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return Path(tempfile.gettempdir()) / f"numba-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+    return of_user
 
 
 # If numba was imported before this package, it read the environment before the package set its variables.

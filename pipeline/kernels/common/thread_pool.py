@@ -55,9 +55,12 @@ class ThreadPool:
         self._pool = ThreadPoolExecutor(worker_count, initializer=self._set_thread_limits) if worker_count > 1 else None
 
     def map(self, function: Callable[..., T], *arguments: Iterable) -> list[T]:
-        """Return the results of `function` for all jobs, in the order of the jobs; `arguments` as in built-in `map`."""
+        """Return the results of `function` for all jobs, in the order of the jobs; `arguments` as in built-in `map`.
+
+        Without arguments there are no jobs.
+        """
         if self._pool is None:
-            return list(map(function, *arguments))
+            return [function(*job) for job in zip(*arguments, strict=False)]
         # The calling thread needs the limit too: MKL has one number of threads for the whole process.
         with torch_threads(self._threads_per_worker):
             return list(self._pool.map(function, *arguments))

@@ -1,5 +1,6 @@
 """Runs with the true motion: placement of the root against a known scale and offset, files against the truth."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +9,12 @@ import pytest
 import torch
 
 from data_tools.evaluate.comparison import Comparison
-from data_tools.evaluate.true_motion import place_roots, true_motion, write_true_input
+from data_tools.evaluate.true_motion import place_roots, prepare_run, true_motion, write_true_input
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
+from pipeline.core.record import RunRecord, read_record, write_record
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.data_tools.ground_truth_run import bent_arm
 
@@ -72,3 +74,26 @@ def test_true_input_needs_a_capture(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no ground truth"):
         write_true_input(tmp_path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_another_video_is_not_taken_over(perfect: Comparison, tmp_path: Path) -> None:
+    capture, supplied, run = perfect.folder.parent, tmp_path / "run-true_input", tmp_path / "run"
+    run.mkdir()
+    write_record(RunRecord(str(tmp_path / "me.mp4")), run)
+    with pytest.raises(UserError, match=r"belongs to the video .*me\.mp4"):
+        prepare_run(capture, supplied, run, "default")
+    assert read_record(run) == RunRecord(str(tmp_path / "me.mp4"))
+
+
+def test_the_true_input_is_of_the_named_capture(perfect: Comparison, tmp_path: Path) -> None:
+    capture, supplied, run = perfect.folder.parent, tmp_path / "run-true_input", tmp_path / "run"
+    for _ in range(2):
+        prepare_run(capture, supplied, run, "instant")
+        assert read_record(run) == RunRecord(str((supplied / "video").resolve()), "instant")
+    other = tmp_path / "other"
+    shutil.copytree(capture / "truth", other / "truth")
+    (other / "truth" / "masks" / "more.png").write_bytes(b"")
+    with pytest.raises(UserError, match="is not of the capture"):
+        prepare_run(other, supplied, run, "instant")
+    with pytest.raises(UserError, match="holds no ground truth"):
+        prepare_run(tmp_path / "none", supplied, run, "instant")
