@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shutil
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,13 +12,14 @@ from data_tools.evaluate.field_truth import score_field
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.field_rows import FieldRow
 from pipeline.core.atomic import atomic_path
-from pipeline.core.manifest import digest_json
+from pipeline.core.manifest import digest_json, read_manifest
 from pipeline.core.measure import describe_environment
 from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
 from stages import field
 
-SCORES_FILE = "scores.json"
+INPUTS = ("frames", "body")
+SCORES_FILE, IDENTITY_FILE = "scores.json", "identity"
 STAGE_SCORES = (
     "validation_psnr_db",
     "validation_psnr_body_db",
@@ -52,8 +54,11 @@ class FieldTrial:
 
     @property
     def identity(self) -> str:
-        """Digest of what the scores depend on, besides the code."""
-        return digest_json({"config": self.config.model_dump(mode="json"), "truth": self.truth is not None})
+        """Digest of what the scores depend on, besides the code: options, frames and body."""
+        manifests = {name: read_manifest(self.run / name) for name in INPUTS}
+        inputs = {name: found.outputs_digest if found else None for name, found in manifests.items()}
+        config = self.config.model_dump(mode="json")
+        return digest_json({"config": config, "truth": self.truth is not None, "inputs": inputs})
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,8 @@ def run_trial(trial: FieldTrial) -> TrialScores:
     finished = read_trial(trial)
     if finished is not None:
         return finished
-    trial.folder.mkdir(parents=True, exist_ok=True)
-    inputs = {name: trial.run / name for name in ("frames", "body")}
+    begin_folder(trial)
+    inputs = {name: trial.run / name for name in INPUTS}
     resumed = (trial.folder / CHECKPOINT_FILE).exists()
     start_s, start_cpu_s = time.monotonic(), _cpu_seconds()
     metrics: dict[str, Any] = dict(field.run(inputs, trial.folder, trial.config))
@@ -93,8 +98,17 @@ def run_trial(trial: FieldTrial) -> TrialScores:
     return result
 
 
+def begin_folder(trial: FieldTrial) -> None:
+    """Make the folder of a trial; what was made there of other options, frames or body is removed."""
+    mark = trial.folder / IDENTITY_FILE
+    if trial.folder.exists() and not (mark.is_file() and mark.read_text(encoding="utf-8") == trial.identity):
+        shutil.rmtree(trial.folder)
+    trial.folder.mkdir(parents=True, exist_ok=True)
+    mark.write_text(trial.identity, encoding="utf-8")
+
+
 def read_trial(trial: FieldTrial) -> TrialScores | None:
-    """Return the scores of a trial; None if it is not finished, or was made with other options."""
+    """Return the scores of a trial; None if it is not finished, or was made of other options, frames or body."""
     path = trial.folder / SCORES_FILE
     if not path.is_file():
         return None

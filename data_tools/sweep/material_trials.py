@@ -16,6 +16,7 @@ from data_tools.sweep.chart_trials import Trial
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import digest_json, digest_video, read_manifest
 from pipeline.core.measure import describe_environment
 from pipeline.mesh.files import load_dense_mesh, load_mesh
 from pipeline.texture.files import load_texture
@@ -48,14 +49,23 @@ class MaterialTrial:
         """The file with the figures."""
         return self.base.out / "figures" / f"{self.name}.json"
 
+    def inputs_digest(self) -> str:
+        """Return the digest of what the texture stage and the scores read: the truth, and the artifacts of the run."""
+        truth = self.base.capture / "truth"
+        digests: dict[str, str | None] = {"truth": digest_video(truth) if truth.is_dir() else None}
+        if not self.true_mesh:
+            manifests = {name: read_manifest(self.base.run_dir / name) for name in TEXTURE.needs}
+            digests |= {name: found.outputs_digest if found else None for name, found in manifests.items()}
+        return digest_json(digests)
+
 
 def read_figures(trial: MaterialTrial) -> dict[str, Any] | None:
-    """Return the stored figures with `commit` and `machine`; None if there are none of today's texture stage."""
+    """Return the stored figures with `commit` and `machine`; None if there are none of today's inputs and stage."""
     if not trial.path.is_file():
         return None
     try:
         stored = json.loads(trial.path.read_text(encoding="utf-8"))
-        is_current = stored["texture_version"] == TEXTURE.version
+        is_current = stored["texture_version"] == TEXTURE.version and stored["inputs"] == trial.inputs_digest()
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{trial.path} is damaged: remove it, and run the same command again") from None
     return dict(stored) if is_current else None
@@ -68,6 +78,7 @@ def measure(trial: MaterialTrial) -> dict[str, Any]:
     environment = describe_environment()
     stored = {
         "texture_version": TEXTURE.version,
+        "inputs": trial.inputs_digest(),
         "commit": environment.get("commit"),
         "environment": environment,
         "figures": figures,

@@ -9,8 +9,9 @@ import pytest
 from data_tools.sweep import ablate_field, field_trials
 from data_tools.sweep.field_rows import ATTENTION, GROUPS, REFERENCE, ROWS, rows_of_group
 from data_tools.sweep.field_tables import COLUMNS, format_difference, paired_scores, write_tables
-from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
+from data_tools.sweep.field_trials import FieldTrial, TrialScores, begin_folder, read_trial, run_trial
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import MANIFEST_FILE, Manifest, write_manifest
 from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
 
@@ -66,10 +67,27 @@ def test_a_finished_training_is_read_and_one_with_other_options_runs_again(tmp_p
     assert json.loads((tmp_path / "one-reference-0" / "scores.json").read_text())["scores"]["parameters"] == 10
 
 
+def test_scores_and_checkpoints_of_other_frames_are_not_used(tmp_path: Path, monkeypatch):
+    """Runs of two people may have the same name, and a run may be made again."""
+    monkeypatch.setattr(field_trials.field, "run", lambda inputs, out, config: {"validation_psnr_db": 30.0})
+    of_person = {name: trial(tmp_path / "out", REFERENCE, str(tmp_path / name / "me")) for name in ("ann", "bob")}
+    for name, each in of_person.items():
+        for stage in ("frames", "body"):
+            folder = each.run / stage
+            folder.mkdir(parents=True)
+            write_manifest(Manifest(stage, 1, "", {}, {}, {"a.npz": name}, {}, 0.0, 0.0), folder / MANIFEST_FILE)
+    run_trial(of_person["ann"])
+    assert read_trial(of_person["ann"]) is not None
+    assert read_trial(of_person["bob"]) is None
+    (of_person["ann"].folder / CHECKPOINT_FILE).touch()
+    assert "cpu_seconds" in run_trial(of_person["bob"]).scores  # not resumed
+    assert not (of_person["bob"].folder / CHECKPOINT_FILE).exists()
+
+
 def test_an_interrupted_training_has_no_seconds(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(field_trials.field, "run", lambda inputs, out, config: {"validation_psnr_db": 30.0})
     interrupted = trial(tmp_path, "rows-half")
-    interrupted.folder.mkdir()
+    begin_folder(interrupted)
     (interrupted.folder / CHECKPOINT_FILE).touch()
     assert set(run_trial(interrupted).scores) == {"validation_psnr_db"}
 

@@ -61,12 +61,20 @@ def test_figures_of_another_version_of_the_stage_are_measured_again(tmp_path: Pa
     assert read_figures(stored) is None
     stored.path.parent.mkdir(parents=True)
     for version, expected in ((TEXTURE.version, FIGURES), (TEXTURE.version - 1, None)):
-        stored.path.write_text(json.dumps({"texture_version": version, "figures": FIGURES}))
+        inputs = {"inputs": stored.inputs_digest()}
+        stored.path.write_text(json.dumps({"texture_version": version, "figures": FIGURES, **inputs}))
         found = read_figures(stored)
         assert (None if found is None else found["figures"]) == expected
     stored.path.write_text("{")
     with pytest.raises(UserError, match="damaged"):
         read_figures(stored)
+
+
+def test_figures_of_another_truth_are_measured_again(stored_capture: Path, tmp_path: Path) -> None:
+    stored = MaterialTrial(Trial(stored_capture, "instant", 0, tmp_path / "out"), true_mesh=True)
+    assert read_figures(stored) is not None
+    (stored_capture / "truth" / "texture.png").write_bytes(b"another")
+    assert read_figures(stored) is None
 
 
 @pytest.mark.parametrize(("stale", "is_run"), [("texture", False), ("mesh", True)])
@@ -94,7 +102,7 @@ def stored_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (capture / "truth").mkdir(parents=True)
     stored = MaterialTrial(Trial(capture, "instant", 0, tmp_path / "out"), true_mesh=True)
     stored.path.parent.mkdir(parents=True)
-    stored.path.write_text(json.dumps(measured(FIGURES)))
+    stored.path.write_text(json.dumps(measured(FIGURES) | {"inputs": stored.inputs_digest()}))
     DOCUMENT.parent.mkdir()
     return capture
 
