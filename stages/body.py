@@ -323,7 +323,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=33,
+    version=34,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

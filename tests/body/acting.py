@@ -25,8 +25,8 @@ from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window, posed
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks
-from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
+from pipeline.geometry.camera import Camera, project, transform_world_to_camera
+from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix, rotation_between
 from pipeline.geometry.skinning import forward_kinematics
 from pipeline.kernels.raster import rasterize
 
@@ -117,9 +117,18 @@ def simulate_detections(
     random = np.random.default_rng(seed)
     noise_px = noise_m * camera.fx / float(depth_m.mean())
     landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
-    relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
+    relative = relative_to_line_of_sight(world, camera).numpy()
     landmarks_3d_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
     return SyntheticRecording(model, state, camera, time_s, landmarks_px, landmarks_3d_m, hands, faces_px)
+
+
+def relative_to_line_of_sight(world_m: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """3D landmarks as a detector sees them that knows a crop around the hips, not where the crop lies in the image."""
+    hips_m = world_m[:, 23:25].mean(1)
+    sight = torch.nn.functional.normalize(transform_world_to_camera(hips_m, camera), dim=1)
+    turn = rotation_between(sight, torch.tensor([0.0, 0.0, 1.0], dtype=sight.dtype).expand_as(sight))
+    to_camera = torch.as_tensor(camera.world_to_camera, dtype=world_m.dtype)[:3, :3]
+    return (world_m - hips_m[:, None]) @ to_camera.T @ turn.mT
 
 
 def swap_left_right(scene: SyntheticRecording, rows: slice | list[int]) -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT, apply_intrinsics_delta
+from pipeline.body.fit.detections.landmarks_3d import Landmark3dTerm
 from pipeline.body.fit.ground_contact import Contact
 from pipeline.body.fit.landmark_regressor import (
     FACE_MESH_START,
@@ -25,7 +26,6 @@ from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.terms import (
     ContactTerm,
     EnergyTerm,
-    Landmark3dTerm,
     LandmarkTerm,
     Linearisation,
     MotionTerm,

@@ -113,7 +113,10 @@ def fit_body(
         if axis is not None and options.focal_relative_std > 0.0:
             # The deviation of the principal point is in focal lengths.
             shift_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
-            options = replace(options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=shift_std)
+            options = replace(options, principal_point_relative_std=shift_std)
+            # The focal length of a turn's axis is a start and no evidence: the same landmarks tell it again in the fit.
+            if axis.is_arc:
+                options = replace(options, focal_relative_std=axis.focal_log_std)
     progress = load_progress(checkpoint)
     if progress is None:
         start = initial_state(

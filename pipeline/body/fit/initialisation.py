@@ -8,10 +8,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
+from pipeline.body.fit.root_placement import line_of_sight_rotation
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix, slerp
 
-TORSO_LANDMARKS = (11, 12, 23, 24)
+LEFT_HIP, RIGHT_HIP = 23, 24
+TORSO_LANDMARKS = (11, 12, LEFT_HIP, RIGHT_HIP)
 
 
 def torso_rotations(
@@ -62,14 +64,12 @@ def initial_state(
     rest_landmarks_m, joints_m: of the default shape. shape: initial shape.
     """
     found = has_torso_landmarks(observations)
-    torso_rotation = torso_rotations(rest_landmarks_m, observations.landmarks_3d_m)
+    landmarks_3d_m = in_world_axes(observations)
+    torso_rotation = torso_rotations(rest_landmarks_m, landmarks_3d_m)
     rotated_m = (rest_landmarks_m - joints_m[0]) @ torso_rotation.transpose(1, 2)
-    scale = (
-        torso_radius_m(rest_landmarks_m[None])[0]
-        / torso_radius_m(observations.landmarks_3d_m[torch.from_numpy(found)]).median()
-    )
+    scale = torso_radius_m(rest_landmarks_m[None])[0] / torso_radius_m(landmarks_3d_m[torch.from_numpy(found)]).median()
     hips_m = 0.5 * (rotated_m[:, 23] + rotated_m[:, 24])
-    relative = observations.landmarks_3d_m * scale + hips_m[:, None]
+    relative = landmarks_3d_m * scale + hips_m[:, None]
     root = solve_root_position(observations, relative)
     torso_rotation, root = _fill_gaps(torso_rotation, root, found)
     rotations = torch.eye(3, dtype=torch.float64).repeat(len(root), len(joints_m), 1, 1)
@@ -81,6 +81,15 @@ def initial_state(
         torch.zeros(offset_count, dtype=torch.float64),
         torch.zeros(INTRINSICS_COUNT, dtype=torch.float64),
     )
+
+
+def in_world_axes(observations: Observations) -> Float[Tensor, "n l 3"]:
+    """Return the 3D landmarks in world axes (m): they are relative to the line of sight to the hips."""
+    camera = observations.camera
+    hips_px = observations.landmarks_px[:, [LEFT_HIP, RIGHT_HIP]].mean(1)
+    direction = (hips_px - hips_px.new_tensor([camera.cx, camera.cy])) / hips_px.new_tensor([camera.fx, camera.fy])
+    to_camera = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
+    return observations.landmarks_3d_m @ to_camera.T @ line_of_sight_rotation(direction)[0] @ to_camera
 
 
 def solve_root_position(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:

@@ -35,3 +35,27 @@ def root_jacobian(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor,
     sideways = torch.stack([depth_m, zero, zero], dim=-1)
     downward = torch.stack([zero, depth_m, zero], dim=-1)
     return pose[:3, :3].T @ torch.stack([sideways, downward, in_camera], dim=-1)
+
+
+def line_of_sight_rotation(
+    direction: Float[Tensor, "n 2"],
+) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 2 3 3"]]:
+    """Return the smallest rotations from camera axes to those whose z axis is a line of sight, and their derivative.
+
+    direction: of the lines, (x / z, y / z) in camera axes.
+    """
+    length = torch.linalg.norm(torch.nn.functional.pad(direction, (0, 1), value=1.0), dim=1)
+    across, along = direction / length[:, None], 1.0 / length  # of the unit vectors of the lines
+    unit = torch.cat([across, along[:, None]], dim=1)
+    unit_jacobian = (torch.eye(3).to(unit)[:2] - across[:, :, None] * unit[:, None]) / length[:, None, None]
+    factor = 1.0 / (1.0 + along)
+    factor_jacobian = -factor[:, None].square() * unit_jacobian[:, :, 2]
+    outer = across[:, :, None] * across[:, None]
+    rotation, jacobian = unit.new_zeros(len(unit), 3, 3), unit.new_zeros(len(unit), 2, 3, 3)
+    rotation[:, :2, :2] = torch.eye(2).to(unit) - factor[:, None, None] * outer
+    rotation[:, :2, 2], rotation[:, 2] = -across, unit
+    half = unit_jacobian[:, :, :2, None] * across[:, None, None]
+    jacobian[:, :, :2, :2] = -factor_jacobian[:, :, None, None] * outer[:, None]
+    jacobian[:, :, :2, :2] -= factor[:, None, None, None] * (half + half.transpose(2, 3))
+    jacobian[:, :, :2, 2], jacobian[:, :, 2] = -unit_jacobian[:, :, :2], unit_jacobian
+    return rotation, jacobian

@@ -61,14 +61,14 @@ SKIN_CHUNK = 8
 class MaskWindow:
     """Mask of one frame in its matching window.
 
-    left_px, top_px: corner of the window in the image. scale: window pixels per image pixel.
+    left_px, top_px: corner of the window in the image. scale: window pixels per image pixel, across and down.
     distance: signed distance to the outline (window pixels, positive outside); normal: its unit gradient (x, y).
     outline: pixels (row, column) of the outline. person_px: height of the person in window pixels.
     """
 
     left_px: int
     top_px: int
-    scale: float
+    scale: Float[np.ndarray, "2"]
     mask: Bool[np.ndarray, "h w"]
     distance: Float[np.ndarray, "h w"]
     normal: Float[np.ndarray, "h w 2"]
@@ -88,12 +88,14 @@ def crop_mask_window(mask: UInt8[np.ndarray, "h w"]) -> MaskWindow | None:
     margin = int(0.2 * person) + 2
     top, bottom = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + margin, mask.shape[0])
     left, right = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + margin, mask.shape[1])
-    scale = min(1.0, PERSON_HEIGHT_PX / person)
-    size = (max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale)))
+    reduction = min(1.0, PERSON_HEIGHT_PX / person)
+    extent_px = right - left, bottom - top
+    size = max(1, round(extent_px[0] * reduction)), max(1, round(extent_px[1] * reduction))
+    scale = np.array(size) / extent_px
     small = cv2.resize(mask[top:bottom, left:right], size, interpolation=cv2.INTER_AREA) > 127
     distance = signed_distance(small)
     return MaskWindow(
-        left, top, scale, small, distance, outward_normals(distance), outline_pixels(small), person * scale
+        left, top, scale, small, distance, outward_normals(distance), outline_pixels(small), person * reduction
     )
 
 
@@ -180,9 +182,9 @@ def rasterise_in_window(
     vertices_world: metres.
     """
     vertices_px, depth_m = project(vertices_world, camera)
-    corner = vertices_px.new_tensor([window.left_px, window.top_px])
+    corner, scale = vertices_px.new_tensor([window.left_px, window.top_px]), vertices_px.new_tensor(window.scale)
     height, width = window.mask.shape
-    face_id, barycentric, _ = rasterize((vertices_px - corner) * window.scale, depth_m, faces, height, width)
+    face_id, barycentric, _ = rasterize((vertices_px - corner) * scale, depth_m, faces, height, width)
     return BodyRaster(face_id.numpy(), barycentric.numpy())
 
 

@@ -68,7 +68,8 @@ class FitState:
 class Observations:
     """Detected landmarks. No value is nan; missing landmarks have confidence 0.
 
-    landmarks_3d_m: relative to the middle of the hips, in world axes, of unknown overall scale.
+    landmarks_3d_m: relative to the middle of the hips, of unknown overall scale, in world axes as if the person were on
+        the optical axis: in truth they are relative to the line of sight (`pipeline.body.fit.detections.landmarks_3d`).
     confidence, confidence_3d: of `landmarks_px` and `landmarks_3d_m`, in [0, 1].
     camera: the camera at which the fit starts.
     """

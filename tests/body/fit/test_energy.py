@@ -7,6 +7,11 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit import energy
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
+from pipeline.body.fit.detections.landmarks_3d import (
+    MAX_DEPTH_SCALE_RATIO,
+    MIN_DEPTH_SCALE_RATIO,
+    fit_3d_landmark_scale,
+)
 from pipeline.body.fit.energy import VERTICAL_PRINCIPAL_POINT_RATIO, EnergyParameters, Objective, compute_px_per_m
 from pipeline.body.fit.initialisation import solve_root_position
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
@@ -15,12 +20,7 @@ from pipeline.body.fit.posed_points import pose_skeleton
 from pipeline.body.fit.prior.priors import default_motion_std, pose_prior, shape_prior
 from pipeline.body.fit.silhouette_icp import match_silhouettes
 from pipeline.body.fit.state import FitState
-from pipeline.body.fit.terms import (
-    MAX_DEPTH_SCALE_RATIO,
-    MIN_DEPTH_SCALE_RATIO,
-    face_landmark_confidence,
-    fit_3d_landmark_scale,
-)
+from pipeline.body.fit.terms import face_landmark_confidence
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.body.acting import synthetic_recording
 
@@ -105,6 +105,20 @@ def test_cropping_does_not_change_the_energy() -> None:
         solve_root_position(each.observations, observations.landmarks_3d_m) for each in (objective, cropped)
     )
     assert torch.allclose(cropped_start, start)
+
+
+def test_3d_landmarks_do_not_tell_where_a_person_is_in_the_picture() -> None:
+    """The detector sees the same crop, and reports the same, when the camera turns about its centre."""
+    objective, state = build(replace(EXACT, landmark_std_m=1e4, hand_std_m=1e4), outlines=False)
+    observations, camera = objective.observations, objective.observations.camera
+    turn = axis_angle_to_matrix(torch.tensor([0.0, 0.35, 0.0], dtype=torch.float64)).numpy()
+    pose = camera.world_to_camera.astype(np.float64)
+    turned = replace(camera, world_to_camera=np.concatenate([turn @ pose[:3], pose[3:]]))
+    to_world = torch.from_numpy(turned.world_to_camera[:3, :3])
+    detected_m = observations.landmarks_3d_m @ torch.from_numpy(pose[:3, :3]).T
+    elsewhere = replace(observations, camera=turned, landmarks_3d_m=detected_m @ to_world)
+    cost = replace(objective, observations=elsewhere)(state).cost
+    assert cost == pytest.approx(objective(state).cost, rel=0.01)
 
 
 def test_principal_point_prior_is_centred() -> None:

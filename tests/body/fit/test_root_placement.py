@@ -1,8 +1,13 @@
 import torch
 
-from pipeline.body.fit.root_placement import perspective_to_world, root_jacobian, world_to_perspective
+from pipeline.body.fit.root_placement import (
+    line_of_sight_rotation,
+    perspective_to_world,
+    root_jacobian,
+    world_to_perspective,
+)
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.geometry.rotation import axis_angle_to_matrix, rotation_between
 
 
 def tilted_camera() -> Camera:
@@ -39,3 +44,19 @@ def test_scaling_the_world_changes_log_depth_only() -> None:
     near, far = world_to_perspective(roots, camera), world_to_perspective(1.3 * roots, camera)
     assert torch.allclose(near[:, :2], far[:, :2])
     assert torch.allclose(far[:, 2] - near[:, 2], torch.full((2,), 1.3, dtype=torch.float64).log())
+
+
+DIRECTIONS = torch.tensor([[0.0, 0.0], [0.4, -0.2], [-1.5, 0.7]], dtype=torch.float64)
+
+
+def test_lines_of_sight_become_the_optical_axis_by_the_smallest_rotation() -> None:
+    lines = torch.nn.functional.normalize(torch.nn.functional.pad(DIRECTIONS, (0, 1), value=1.0), dim=1)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(lines)
+    assert torch.allclose(line_of_sight_rotation(DIRECTIONS)[0], rotation_between(lines, axis))
+
+
+def test_derivative_of_the_line_of_sight_agrees_with_differences() -> None:
+    _, jacobian = line_of_sight_rotation(DIRECTIONS)
+    for axis, step in enumerate(1e-6 * torch.eye(2, dtype=torch.float64)):
+        ahead, behind = (line_of_sight_rotation(DIRECTIONS + sign * step)[0] for sign in (1.0, -1.0))
+        assert torch.allclose(jacobian[:, axis], (ahead - behind) / 2e-6, atol=1e-8)

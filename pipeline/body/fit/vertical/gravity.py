@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact, floor_tilt_information, sole_points
-from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks, torso_rotations
+from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks, in_world_axes, torso_rotations
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import PosedSkeleton, pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
@@ -136,15 +136,20 @@ def turn_observations(
     axis: None if the person hardly turns.
     """
     to_vertical = rotation_between(up, _y_axis())
-    directions = observations.landmarks_3d_m @ to_vertical.T
     camera = observations.camera
     if axis is not None:
-        rotation = torso_rotations(rest_landmarks_m, directions[has_torso_landmarks(observations)])
-        directions = directions @ rotation_between(rotation[:, :, 1].mean(0), _y_axis()).T
         zoom = float(np.exp(axis.focal_log))
         camera = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
-    camera = turn_camera(camera, to_vertical, torch.zeros(3, dtype=torch.float64))
-    return replace(observations, landmarks_3d_m=directions, camera=camera)
+    turned = replace(
+        observations,
+        landmarks_3d_m=observations.landmarks_3d_m @ to_vertical.T,
+        camera=turn_camera(camera, to_vertical, torch.zeros(3, dtype=torch.float64)),
+    )
+    if axis is None:
+        return turned
+    rotation = torso_rotations(rest_landmarks_m, in_world_axes(turned)[has_torso_landmarks(observations)])
+    to_upright = rotation_between(rotation[:, :, 1].mean(0), _y_axis())
+    return replace(turned, landmarks_3d_m=turned.landmarks_3d_m @ to_upright.T)
 
 
 def align_with_gravity(

@@ -71,12 +71,14 @@ class TurnAxis:
     tilt_rad: slope of the axis to the right and towards a level camera: the axis is (right, 1, towards), normalised.
     std_rad: of each.
     focal_log, focal_log_std: logarithm of the focal length over the camera's, and its standard deviation.
+    is_arc: whether it is the axis of an arc, which shows the focal length less than a turn does.
     """
 
     tilt_rad: Float[np.ndarray, "2"]
     std_rad: Float[np.ndarray, "2"]
     focal_log: float
     focal_log_std: float
+    is_arc: bool = False
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,8 @@ def estimate_turn_axis(
     # The median distance of points with normal errors is 1.18 standard deviations.
     noise = max(float(np.median(residual)) / (1.18 * LANDMARK_STD_RATIO), 1.0)
     std = STD_FACTOR * noise * np.sqrt(np.diag(covariance)[-3:])
-    return TurnAxis(found.x[-3:-1], std[:2], float(found.x[-1]), float(np.hypot(std[2], COMMON_FOCAL_LOG_STD)))
+    focal_log_std = float(np.hypot(std[2], COMMON_FOCAL_LOG_STD))
+    return TurnAxis(found.x[-3:-1], std[:2], float(found.x[-1]), focal_log_std, is_arc)
 
 
 def contradicting_focal_log(observations: Observations) -> float:

@@ -9,10 +9,11 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit import fit as fit_module
 from pipeline.body.fit.ground_contact import FLOOR_TILT_STD_RAD, floor_tilt_information, sole_points
+from pipeline.body.fit.initialisation import in_world_axes
 from pipeline.body.fit.landmark_regressor import landmark_regressor
 from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
-from pipeline.body.fit.state import FitState
+from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.vertical.gravity import (
     LEAN_GAIN_TOWARDS,
     MAX_TURN_RAD,
@@ -147,7 +148,8 @@ def test_observations_of_a_turn_become_upright() -> None:
     up = rotation_deg(10.0, 0.0, 0.0)[:, 1]
     axis = TurnAxis(np.zeros(2), np.ones(2), focal_log=float(np.log(1.25)), focal_log_std=0.1)
     turned = turn_observations(observations, up, axis, rest)
-    torso = turned.landmarks_3d_m[:, 11:13].mean(1) - turned.landmarks_3d_m[:, 23:25].mean(1)
+    upright_m = in_world_axes(turned)
+    torso = upright_m[:, 11:13].mean(1) - upright_m[:, 23:25].mean(1)
     lean = torso.mean(0)
     assert np.degrees(np.arctan2(float(lean[2]), float(lean[1]))) == pytest.approx(0.0, abs=3.0)
     assert camera_tilt_deg(turned.camera) == pytest.approx((-10.0, 0.0), abs=1e-4)
@@ -204,3 +206,24 @@ def test_silhouettes_mend_a_wrong_axis(monkeypatch: pytest.MonkeyPatch) -> None:
     options = FitOptions(shared_frames=12, rounds=6, vertical_is_known=False)
     result = fit_module.fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options)
     assert camera_tilt_deg(result.camera) == pytest.approx((0.0, 0.0), abs=1.5)
+
+
+@pytest.mark.parametrize(("is_arc", "found_std"), [(False, 0.5), (True, 0.1)])
+def test_landmarks_of_a_turn_do_not_tell_the_focal_length_twice(
+    is_arc: bool, found_std: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fit starts with the focal length of the axis; only that of an arc, which tells little, is evidence."""
+    found: list[tuple[float, float]] = []
+
+    def stop(context: object, observations: Observations, *arguments: object) -> None:
+        found.extend((observations.camera.fx, each.focal_relative_std) for each in arguments if hasattr(each, "rounds"))
+        raise KeyboardInterrupt
+
+    scene = standing(2 * np.pi)
+    axis = TurnAxis(np.zeros(2), np.ones(2), focal_log=float(np.log(1.25)), focal_log_std=0.1, is_arc=is_arc)
+    monkeypatch.setattr(fit_module, "estimate_turn_axis", lambda *_: axis)
+    monkeypatch.setattr(fit_module, "_fit_shared", stop)
+    options = FitOptions(focal_relative_std=0.5, vertical_is_known=False)
+    with pytest.raises(KeyboardInterrupt):
+        fit_module.fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options)
+    assert found == [(pytest.approx(1.25 * scene.camera.fx), found_std)]
