@@ -266,7 +266,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=17,
+    version=18,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

@@ -44,7 +44,7 @@ def write_frames(
 
     Both are stabilised where the detections are. User-supplied masks are otherwise unchanged; masks of the detector
     are smoothed over neighbouring frames and refined to alpha mattes. Pixels with partial alpha get the estimated
-    foreground colour.
+    foreground colour; those of images with their own alpha only as far as they lack it.
     """
     plate = (
         None if user_files.read_mask is not None else estimate_background(source, user_files, detections, max_side_px)
@@ -63,7 +63,7 @@ def write_frames(
                 mask = read_user_mask(user_files, near[centre])
                 if mask is not None and detections.to_stabilised is not None:
                     mask = warp_image(mask, detections.to_stabilised[position], is_mask=True)
-                yield images[centre], mask, out, near[centre].index
+                yield images[centre], mask, out, near[centre].index, user_files.masks_are_own_alpha
             else:
                 masks = [detections.masks_png[p] for p in _temporal_neighbours(position, detections)]
                 yield images, masks, out, near[centre].index, centre, noise, plate
@@ -128,8 +128,14 @@ def _temporal_windows(
             buffered = {index: kept for index, kept in buffered.items() if index >= near[0]}
 
 
-def _write_frame(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], out: Path, frame_index: int) -> None:
-    write_rgb(image_path(out, frame_index), decontaminate_colours(rgb, mask))
+def _write_frame(
+    rgb: UInt8[np.ndarray, "h w 3"],
+    mask: UInt8[np.ndarray, "h w"],
+    out: Path,
+    frame_index: int,
+    is_own_alpha: bool = False,
+) -> None:
+    write_rgb(image_path(out, frame_index), decontaminate_colours(rgb, mask, is_own_alpha=is_own_alpha))
     write_gray(mask_path(out, frame_index), mask)
 
 

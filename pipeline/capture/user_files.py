@@ -43,6 +43,7 @@ from pipeline.io.npz import load_npz
 _MAX_PRINCIPAL_POINT_OFFSET = 0.2
 # So many masks tell the largest level, and whether they show the person.
 _N_MASKS_SAMPLED = 8
+_OWN_ALPHA = "the images' alpha channel"
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
@@ -127,6 +128,11 @@ class UserFiles:
     split: UserSplit | None = None
     smpl_poses: SmplPoses | None = None
 
+    @property
+    def masks_are_own_alpha(self) -> bool:
+        """Whether the masks are the images' own alpha, with which their colours are usually straight."""
+        return self.mask_source == _OWN_ALPHA
+
 
 def load_user_files(path: Path, source: FrameSource) -> UserFiles:
     """Read the user-supplied inputs in the video folder; a video file has none.
@@ -161,7 +167,7 @@ def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.nda
     if (path / "masks.hdf5").is_file():
         return _masks_from_array(_read_hdf5_masks(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
     if source.files and (read_mask := _masks_from_alpha(path, source.files)) is not None:
-        return read_mask, "the images' alpha channel"
+        return read_mask, _OWN_ALPHA
     return None, ""
 
 

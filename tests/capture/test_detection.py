@@ -14,7 +14,7 @@ from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import Frame, open_frame_source
 from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.errors import UserError
-from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
+from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb, write_rgba
 from pipeline.io.npz import load_npz, save_npz
 
 
@@ -176,6 +176,23 @@ def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
     np.testing.assert_allclose(written[4:36, 16:26], 200, atol=1)
     np.testing.assert_array_equal(written[[3, 36], 16:26], 14)
     np.testing.assert_array_equal(read_gray(mask_path(out, 4)), mask)
+
+
+def test_images_with_straight_alpha_keep_their_colours(tmp_path, detector):
+    """A grey bar with a soft rim before transparent black; a soft pixel is as grey as the others."""
+    (tmp_path / "in").mkdir()
+    alpha = np.zeros((40, 60), np.uint8)
+    alpha[4:36, 16:26] = 128
+    alpha[6:34, 18:24] = 255
+    rgb = np.where(alpha[..., None] > 0, np.uint8(100), np.uint8(0)).repeat(3, 2)
+    for k in range(3):
+        write_rgba(tmp_path / "in" / f"{k}.png", np.dstack([rgb, alpha]))
+    source, user_files, seen = detect_recording(tmp_path)
+    (tmp_path / "out").mkdir()
+    with start_worker_pool(1) as workers:
+        write_frames(source, user_files, seen, [1], tmp_path / "out", 60, 1.0, workers)
+    np.testing.assert_array_equal(read_rgb(image_path(tmp_path / "out", 1)), rgb)
+    np.testing.assert_array_equal(read_gray(mask_path(tmp_path / "out", 1)), alpha)
 
 
 def test_a_mask_of_another_shape_is_named(folder):

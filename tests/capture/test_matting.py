@@ -230,6 +230,23 @@ def test_without_a_rim_or_without_one_of_its_sides_nothing_changes(alpha: np.nda
     np.testing.assert_array_equal(matte.decontaminate_colours(image, alpha.astype(np.uint8)), image)
 
 
+@pytest.mark.parametrize("reduction", [1, 2, 4])
+@pytest.mark.parametrize("is_straight", [True, False], ids=["straight", "blended with black"])
+def test_cut_outs_have_the_colour_of_the_person_in_their_soft_pixels(is_straight: bool, reduction: int) -> None:
+    """Transparent black around a person of one colour, reduced by area averages as frames are."""
+    alpha = make_soft_disc()
+    image = np.where(alpha[..., None] > 0, (100, 120, 60), 0).astype(np.uint8)
+    if not is_straight:
+        image = composite_colours((100, 120, 60), (0, 0, 0), alpha)
+    side_px = SIDE_PX // reduction
+    image, alpha = (cv2.resize(one, (side_px, side_px), interpolation=cv2.INTER_AREA) for one in (image, alpha))
+    found = matte.decontaminate_colours(image, alpha, is_own_alpha=True).astype(float)
+    error = np.abs(found - (100, 120, 60)).mean(axis=-1)[alpha > 0] * alpha[alpha > 0] / 255.0
+    assert error.mean() < (0.1 if reduction == 1 else 1.5)
+    if is_straight and reduction == 1:
+        np.testing.assert_array_equal(found, image)
+
+
 def test_a_picture_of_one_colour_stays() -> None:
     image = np.full((SIDE_PX, SIDE_PX, 3), 77, np.uint8)
     np.testing.assert_array_equal(matte.decontaminate_colours(image, make_soft_disc(3.0)), image)

@@ -141,13 +141,17 @@ def clean_alpha_matte(
 
 
 def decontaminate_colours(
-    rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]
+    rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"], *, is_own_alpha: bool = False
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Replace the background's contribution to pixels of partial alpha (1 to 254) by the foreground colour.
 
     With F' and B', the colours of the nearest pure foreground and background pixels, a pixel becomes I + (1 - alpha)
     (F' - B'), which is alpha F + (1 - alpha) F' if B' = B; nothing is divided by a small alpha. All other pixels stay,
     and all pixels if there is no pure foreground or background.
+
+    is_own_alpha: the image came with alpha. Straight alpha leaves F in soft pixels, and they stay; cut-outs that were
+        blended with black (rembg) or reduced without regard to alpha hold B as well. The part of (1 - alpha) (F' - B')
+        that soft pixels lack of F', a least-squares fit of premultiplied colours, is added.
     """
     soft = (alpha > 0) & (alpha < 255)
     if not soft.any():
@@ -166,9 +170,14 @@ def decontaminate_colours(
     person, backdrop = (
         rgb[window].reshape(-1, 3)[_nearest_pixel_index(side)[soft]].astype(np.float32) for side in sides
     )
-    share = 1.0 - alpha[window][soft, None] / np.float32(255.0)
+    covered = alpha[window][soft, None] / np.float32(255.0)
+    observed, missing = rgb[window][soft].astype(np.float32), (1.0 - covered) * (person - backdrop)
+    if is_own_alpha:
+        weighted = covered**2 * missing
+        lacking, whole = (float((weighted * colours).sum()) for colours in (person - observed, missing))
+        missing *= np.float32(np.clip(lacking / max(whole, 1.0), 0.0, 1.0))
     result = rgb.copy()
-    result[window][soft] = np.rint(np.clip(rgb[window][soft] + share * (person - backdrop), 0.0, 255.0))
+    result[window][soft] = np.rint(np.clip(observed + missing, 0.0, 255.0))
     return result
 
 
