@@ -31,11 +31,11 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
 from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
-from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
+from pipeline.capture.video import FrameSource, image_size_px, images_in
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
-from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
+from pipeline.io.image import read_alpha, read_gray
 from pipeline.io.npz import load_npz
 
 # Maximum distance of a principal point from the centre, as a fraction of the side, if the image size of the calibration
@@ -206,7 +206,7 @@ def _check_masks(name: str, sampled: Sequence[np.ndarray]) -> float:
 
 
 def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
-    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_sort_key)
+    files: Sequence[Path] = images_in(folder)
     by_stem = {p.stem: p for p in files}
     names = [image.stem for image in source.files]
     if any(name in by_stem for name in names):

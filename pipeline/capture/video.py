@@ -74,7 +74,7 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
         return _open_video(path)
     if not path.is_dir():
         raise UserError(f"{path} does not exist; supply a video file or a folder of images")
-    files = _images_in(path)
+    files = images_in(path)
     videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
     if files and len(videos) == 1:
         raise UserError(f"{path} holds images ({files[0].name}) and a video ({videos[0].name}); move one of them away")
@@ -85,8 +85,8 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
     if videos:
         raise UserError(f"{path} holds {len(videos)} videos; choose one of them, for example {videos[0]}")
     for folder in (path / name for name in _IMAGE_FOLDER_NAMES):
-        if folder.is_dir() and _images_in(folder):
-            files = _images_in(folder)
+        if folder.is_dir() and images_in(folder):
+            files = images_in(folder)
             return FrameSource(folder, files, len(files), image_fps)
     if not any(path.iterdir()):
         raise UserError(f"folder {path} is empty; put a video or images of the person into it")
@@ -164,7 +164,8 @@ def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
-def _images_in(folder: Path) -> tuple[Path, ...]:
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Return the images of a folder in natural order, without hidden ones (`._*`, which macOS adds)."""
     found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
     return tuple(sorted(found, key=natural_sort_key))
 

@@ -76,6 +76,14 @@ def test_extra_mask_is_refused_when_names_do_not_match(tmp_path, source):
         load_user_files(tmp_path, source)
 
 
+def test_hidden_files_are_no_masks(tmp_path, source):
+    """macOS adds a `._*` to each file on other file systems."""
+    write_masks(tmp_path, m1=85, m2=170, m10=255)
+    for name in ("m1", "m2", "m10"):
+        (tmp_path / "masks" / f"._{name}.png").write_bytes(b"\0\5\26\7")
+    assert levels_of(load_user_files(tmp_path, source)) == [85, 170, 255]
+
+
 def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
     """As many as there are images, most of them named as one: in natural order each would belong to another frame."""
     write_masks(tmp_path, x2=20, x10=30, x11=40)
