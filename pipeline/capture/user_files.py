@@ -1,6 +1,6 @@
 """User-supplied inputs, which override the detector: masks, landmarks, a camera, a split, SMPL poses.
 
-    masks/        one image per frame, with the names of the images or in natural order
+    masks/        one image per frame, with the names of the images or in natural order; cut-outs by their alpha
     masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as in PeopleSnapshot
     (none)        alpha channel of the images, if they are partly transparent
     landmarks.npz MediaPipe's 33 landmarks: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan where
@@ -217,6 +217,8 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
             )
         files = [by_stem[name] for name in names]
     _check_frame_count(folder, len(files), source)
+    if (read_mask := _masks_from_alpha(folder, files)) is not None:
+        return read_mask
     highest = _check_masks(f"{folder}/", [read_gray(files[k]) for k in _sampled(len(files))])
     return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=255.0 / highest)
 

@@ -84,6 +84,17 @@ def test_hidden_files_are_no_masks(tmp_path, source):
     assert levels_of(load_user_files(tmp_path, source)) == [85, 170, 255]
 
 
+def test_cut_outs_in_the_mask_folder_are_read_by_their_alpha(tmp_path, source):
+    """As rembg writes them: the person's colours, dark trousers among them, before transparent black."""
+    (tmp_path / "masks").mkdir()
+    for name, level in (("x1", 255), ("x2", 128), ("x10", 255)):
+        write_rgba(tmp_path / "masks" / f"{name}.png", np.dstack([person(30), person(30), person(40), person(level)]))
+    assert levels_of(load_user_files(tmp_path, source)) == [255, 128, 255]
+    write_gray(tmp_path / "masks" / "x2.png", person(255))
+    with pytest.raises(UserError, match=r"masks/x2\.png has no transparency, x1\.png has; make the background"):
+        load_user_files(tmp_path, source)
+
+
 def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
     """As many as there are images, most of them named as one: in natural order each would belong to another frame."""
     write_masks(tmp_path, x2=20, x10=30, x11=40)
