@@ -35,7 +35,7 @@ from pipeline.capture.video import FrameSource, image_size_px, images_in
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
-from pipeline.io.image import read_alpha, read_gray
+from pipeline.io.image import read_alpha, read_gray_uint16
 from pipeline.io.npz import load_npz
 
 # Maximum distance of a principal point from the centre, as a fraction of the side, if the image size of the calibration
@@ -219,8 +219,8 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
     _check_frame_count(folder, len(files), source)
     if (read_mask := _masks_from_alpha(folder, files)) is not None:
         return read_mask
-    highest = _check_masks(f"{folder}/", [read_gray(files[k]) for k in _sampled(len(files))])
-    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=255.0 / highest)
+    highest = _check_masks(f"{folder}/", [read_gray_uint16(files[k]) for k in _sampled(len(files))])
+    return lambda index: _to_255(read_gray_uint16(files[index]), highest)
 
 
 def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
@@ -229,7 +229,12 @@ def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Cal
     _check_frame_count(path, len(masks), source)
     _check_masks(str(path), [masks[k] for k in _sampled(len(masks))])
     highest = float(masks.max())
-    return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / highest)).astype(np.uint8)
+    return lambda index: _to_255(masks[index], highest)
+
+
+def _to_255(mask: np.ndarray, highest: float) -> UInt8[np.ndarray, "h w"]:
+    """Return a mask whose level `highest` becomes 255, as do those above it."""
+    return np.rint(np.minimum(mask.astype(np.float32) * 255.0 / highest, 255.0)).astype(np.uint8)
 
 
 def _read_hdf5_masks(path: Path) -> np.ndarray:

@@ -101,9 +101,18 @@ def read_gray(path: Path) -> UInt8[np.ndarray, "h w"]:
     Colours become luma, an ICC profile is ignored, an alpha channel is dropped. Raises UserError as `read_rgb`.
     """
     decoded = _decode(path)
-    colour = to_uint8(decoded.colour)
-    gray = np.rint(colour @ _LUMA).astype(np.uint8) if colour.shape[2] == 3 else colour[..., 0]
-    return _upright(gray, decoded.orientation)
+    return _upright(_luma(to_uint8(decoded.colour)), decoded.orientation)
+
+
+def read_gray_uint16(path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Read an image of one channel as `read_gray` does, in 16 bits: those of the file, or 257 times its 8-bit levels.
+
+    Raises UserError as `read_rgb`.
+    """
+    decoded = _decode(path)
+    colour = decoded.colour if decoded.colour.dtype == np.uint16 else to_uint8(decoded.colour)
+    gray = _luma(colour).astype(np.uint16)
+    return _upright(gray if colour.dtype == np.uint16 else 257 * gray, decoded.orientation)
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
@@ -304,6 +313,10 @@ def _upright(pixels: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[np.n
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
     return np.ascontiguousarray(pixels)
+
+
+def _luma(colour: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w"]:
+    return np.rint(colour @ _LUMA).astype(colour.dtype) if colour.shape[2] == 3 else colour[..., 0]
 
 
 def _three_channels(colour: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w 3"]:

@@ -152,6 +152,16 @@ def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):
     assert levels_of(load_user_files(tmp_path, source)) == [0, 255, 0]
 
 
+@pytest.mark.parametrize("highest", [1, 200, 65535])
+def test_a_folder_of_16_bits_is_brought_to_255(tmp_path, source, highest):
+    """Labels 0 and 1 round to nothing in 8 bits."""
+    (tmp_path / "masks").mkdir()
+    for name, level in (("m1", 0), ("m2", highest), ("m3", highest // 2)):
+        write_gray(tmp_path / "masks" / f"{name}.png", person(1).astype(np.uint16) * level)
+    half = {1: 0, 200: 128, 65535: 127}[highest]
+    assert levels_of(load_user_files(tmp_path, source)) == [0, 255, half]
+
+
 def test_the_largest_level_of_a_folder_counts_as_255(tmp_path, source):
     """As in an array; a mask with nothing but specks of 1 still shows nobody."""
     write_masks(tmp_path, m1=1, m2=100, m3=200)
