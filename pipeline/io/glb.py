@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import parse_json
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 
 _COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -191,7 +192,9 @@ class GlbFile:
         return found
 
     def base_colour(self, material: int) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the base colour texture of a material times its factor; 8 x 8 texels if it has no texture.
+        """Return the base colour texture of a material times its factor, in sRGB; 8 x 8 texels if it has no texture.
+
+        The factor is one of linear light (3.9.2 of the specification).
 
         material: index; -1 means no material (white).
 
@@ -201,12 +204,14 @@ class GlbFile:
         with self.checked():
             surface = self.gltf["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
             factor = np.clip(np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3], dtype=np.float64), 0.0, 1.0)
+            light = srgb_to_linear(np.arange(256)[:, None] / 255.0) * factor
+            levels = np.rint(255.0 * linear_to_srgb(light)).astype(np.uint8)
             if "baseColorTexture" not in surface:
-                return np.tile(np.rint(255 * factor).astype(np.uint8), (_UNTEXTURED_SIDE_PX, _UNTEXTURED_SIDE_PX, 1))
+                return np.tile(levels[255], (_UNTEXTURED_SIDE_PX, _UNTEXTURED_SIDE_PX, 1))
             texture = self.gltf["textures"][surface["baseColorTexture"]["index"]]
             if "source" not in texture:
                 raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
-            return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
+            return levels[self._decode_image(texture["source"]), np.arange(3)]
 
     def _view_array(self, owner: dict[str, Any], component_type: int, count: int, width: int) -> np.ndarray:
         """Return the rows in the buffer view of an accessor or of a part of a sparse one."""

@@ -15,12 +15,14 @@ from PIL import Image
 from pipeline.core.errors import UserError
 from pipeline.io.glb import GlbFile
 
+TEXELS = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 
-def textured_box(path: Path) -> Path:
-    """A box with UV and a 4 x 4 texture, written by trimesh."""
+
+def textured_box(path: Path, texels: np.ndarray = TEXELS) -> Path:
+    """A box with UV and a texture, written by trimesh."""
     box = trimesh.creation.box((0.4, 1.8, 0.3))
     uv = np.random.default_rng(0).uniform(size=(len(box.vertices), 2))
-    texture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    texture = Image.fromarray(texels)
     box.visual = trimesh.visual.TextureVisuals(
         uv=uv, material=trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
     )
@@ -58,17 +60,28 @@ def test_accessors_equal_what_trimesh_reads(box_path: Path) -> None:
 
 def test_embedded_image_is_decoded_and_returned_as_stored(box_path: Path) -> None:
     glb = GlbFile(box_path)
-    expected = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    np.testing.assert_array_equal(glb.base_colour(0), expected)
-    np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(glb.image_bytes(0))).convert("RGB")), expected)
+    np.testing.assert_array_equal(glb.base_colour(0), TEXELS)
+    np.testing.assert_array_equal(np.asarray(Image.open(BytesIO(glb.image_bytes(0))).convert("RGB")), TEXELS)
 
 
 def test_material_without_texture_has_its_factor_as_colour(box_path: Path) -> None:
     def set_factor(tree: dict[str, Any]) -> None:
         tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1.0, 0.5, 0.0, 1.0]}}]
 
-    assert GlbFile(rewrite_json(box_path, set_factor)).base_colour(0)[0, 0].tolist() == [255, 128, 0]
+    assert GlbFile(rewrite_json(box_path, set_factor)).base_colour(0)[0, 0].tolist() == [255, 188, 0]
     assert (GlbFile(box_path).base_colour(-1) == 255).all()
+
+
+def test_factor_of_a_texture_is_one_of_linear_light(tmp_path: Path) -> None:
+    """Half of the light of white is level 188, a quarter 137."""
+
+    def set_factor(tree: dict[str, Any]) -> None:
+        tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0.25, 1.0, 1.0]
+
+    texels = np.full((4, 4, 3), (255, 255, 77), np.uint8)
+    texels[0] = (188, 0, 0)
+    box = rewrite_json(textured_box(tmp_path / "box.glb", texels), set_factor)
+    assert GlbFile(box).base_colour(0)[:2, 0].tolist() == [[137, 0, 0], [188, 137, 77]]
 
 
 def test_node_to_world_chains_parents(box_path: Path) -> None:

@@ -34,12 +34,12 @@ def made_up(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_accessors(made_up: Path) -> None:
-    """Normalised integers with a stride become fractions; the colour factor multiplies the texture."""
+    """Normalised integers with a stride become fractions; the colour factor halves the green light (120 to 86)."""
     glb = GlbFile(made_up)
     primitive = glb.skinned_primitives()[0]
     assert np.allclose(primitive.positions * POSITION_RANGE_M, box_vertices(), atol=POSITION_RANGE_M / 32767)
     assert np.allclose(primitive.weights.sum(axis=1), 1.0)
-    assert glb.base_colour(0)[0, 0].tolist() == [COLOUR[0], COLOUR[1] // 2, COLOUR[2]]
+    assert glb.base_colour(0)[0, 0].tolist() == [COLOUR[0], 86, COLOUR[2]]
 
 
 def test_metres_and_joints(made_up: Path) -> None:
