@@ -316,14 +316,20 @@ def _is_cut_off(
 ) -> Bool[np.ndarray, "n"]:
     """Return in which frames the person meets what the camera did not see, or runs over the edge only afterwards.
 
+    Whoever ends before the edge of a frame is seen whole, however near what the camera did not see begins.
+
     before, after: masks of the person in the frames, and in the stabilised pictures.
     """
     filmed, edge = np.full(before.shape[1:], 255, np.uint8), np.ones(before.shape[1:], dtype=bool)
     edge[1:-1, 1:-1] = False
+    size_px = before.shape[2], before.shape[1]
     is_cut = []
     for mask_before, mask_after, homography in zip(before, after, to_stabilised, strict=True):
-        unseen = (warp_image(filmed, homography, is_mask=True) < 255).astype(np.uint8)
-        near_unseen = cv2.dilate(unseen, np.ones((3, 3), np.uint8)) > 0
-        runs_over = (mask_after & edge).any() and not (mask_before & edge).any()
-        is_cut.append(bool((mask_after & near_unseen & ~edge).any() or runs_over))
+        if (mask_before & edge).any():
+            unseen = (warp_image(filmed, homography, is_mask=True) < 255).astype(np.uint8)
+            near_unseen = cv2.dilate(unseen, np.ones((3, 3), np.uint8)) > 0
+            is_cut.append(bool((mask_after & near_unseen & ~edge).any()))
+        else:
+            moved = apply_homography(homography, np.argwhere(mask_before)[:, ::-1] + 0.5)
+            is_cut.append(bool(((moved < 0.0) | (moved > size_px)).any()))
     return np.array(is_cut)

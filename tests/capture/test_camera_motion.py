@@ -185,6 +185,17 @@ def test_frames_that_cut_off_the_person_before_or_afterwards_are_left_out(pitch_
     assert len(cut.masks_png) == len(cut.hands.landmarks_px) == len(cut.to_stabilised) == COUNT - 1
 
 
+@pytest.mark.parametrize(("pitch_rad", "rows"), [(-0.06, (40, 179)), (0.06, (1, 140))])
+def test_a_person_who_ends_just_before_the_edge_is_not_cut_off(pitch_rad, rows):
+    """Frame 4 shows the whole person; in the stabilised picture what was not filmed begins one pixel further on."""
+    motion = 0.3 * true_motion()
+    motion[2:7] = np.outer(pitch_rad * np.array((0.17, 0.58, 1.0, 0.58, 0.17)), (0.0, 1.0, 0.0, 0.0))
+    shaken = recording(motion)
+    shaken.person_masks[4, slice(*rows), 150:160] = True
+    whole = stabilise_detections(shaken, FOCAL_RATIO * WIDTH)
+    np.testing.assert_array_equal(whole.frame_index, np.arange(COUNT))
+
+
 def test_motion_in_pixels_is_that_of_the_farthest_corner():
     motion = CameraMotion(np.zeros((COUNT, 4)), np.ones(COUNT, bool), FOCAL_RATIO)
     assert camera_motion_px(motion.to_stabilised_camera((WIDTH, HEIGHT)), (WIDTH, HEIGHT)) == 0.0
