@@ -125,7 +125,7 @@ def stabilise_camera(detections: Detections, source: FrameSource, user_files: Us
         return detections, 0.0
     motion_px = camera_motion_px(stabilised.to_stabilised, (stabilised.width, stabilised.height))
     n_dropped = len(detections.frame_index) - len(stabilised.frame_index)
-    dropped = f", {n_dropped} of them, which would cut off the person, left out" if n_dropped else ""
+    dropped = f", {n_dropped} left out, which would cut off the person or whose motion is unknown" if n_dropped else ""
     warn(
         f"the camera of {source.path} moves, its picture by up to {motion_px:.0f} px: the frames are stabilised"
         f"{dropped}; film with a stand for more detail"

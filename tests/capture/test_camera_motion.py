@@ -243,3 +243,14 @@ def test_a_moving_camera_is_told_unless_the_camera_is_supplied(tmp_path):
     (tmp_path / "camera.json").write_text('{"fx": 384, "fy": 384, "cx": 160, "cy": 90}')
     assert stabilise_camera(shaken, source, load_user_files(tmp_path, source)) == (shaken, 0.0)
     assert take_warnings() == []
+
+
+def test_frames_of_unknown_motion_are_told_as_such(tmp_path):
+    shaken = recording(true_motion())
+    shaken.gray_thumbnails[4] = 120
+    write_rgb(tmp_path / "0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    source = open_frame_source(tmp_path)
+    stabilised, _ = stabilise_camera(shaken, source, load_user_files(tmp_path, source))
+    np.testing.assert_array_equal(stabilised.frame_index, np.delete(np.arange(COUNT), 4))
+    (text,) = take_warnings()
+    assert "stabilised, 1 left out, which would cut off the person or whose motion is unknown; film" in text
