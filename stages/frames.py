@@ -115,15 +115,20 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 def stabilise_camera(detections: Detections, source: FrameSource, user_files: UserFiles) -> tuple[Detections, float]:
     """Return the detections in stabilised pictures, and how far the camera moved the corners of its picture, px.
 
-    Detections of a still camera stay as they are (0 px); so do all if a camera or SMPL motion is supplied, which
-    belongs to the frames of the recording.
+    Detections of a still camera stay as they are (0 px); so do all if the camera's place or SMPL motion is supplied,
+    which belongs to the frames of the recording. Supplied intrinsics hold for stabilised pictures as well.
     """
-    if user_files.camera is not None or user_files.smpl_poses is not None:
+    size_px, calibration = (detections.width, detections.height), user_files.camera
+    if user_files.smpl_poses is not None or (calibration is not None and calibration.world_to_camera is not None):
         return detections, 0.0
-    stabilised = stabilise_detections(detections, metadata_focal_px(source, detections.width, detections.height))
+    if calibration is None:
+        stabilised = stabilise_detections(detections, metadata_focal_px(source, *size_px))
+    else:
+        camera = calibration.to_camera(detections.scale, *size_px)
+        stabilised = stabilise_detections(detections, camera.fx, (camera.cx, camera.cy))
     if stabilised.to_stabilised is None:
         return detections, 0.0
-    motion_px = camera_motion_px(stabilised.to_stabilised, (stabilised.width, stabilised.height))
+    motion_px = camera_motion_px(stabilised.to_stabilised, size_px)
     n_dropped = len(detections.frame_index) - len(stabilised.frame_index)
     dropped = f", {n_dropped} left out, which would cut off the person or whose motion is unknown" if n_dropped else ""
     warn(

@@ -35,6 +35,7 @@ _WINDOW_PX, _PYRAMID_LEVELS, _MAX_ROUND_TRIP_PX = 15, 3, 0.5
 # Robust fit: iterations, step (rad) that ends them, scale of the Cauchy weights, distance within which corners agree.
 _ITERATIONS, _SMALL_STEP, _CAUCHY_PX, _INLIER_PX = 20, 1e-5, 0.3, 1.0
 _MIN_CORNERS, _MIN_INLIER_SHARE = 20, 0.5
+_MIDDLE = (0.5, 0.5)
 # Share of the frames with a person that must remain.
 _MIN_KEPT_SHARE = 0.9
 # The scene must differ in so much fewer frames afterwards.
@@ -46,40 +47,46 @@ class CameraMotion(NamedTuple):
 
     parameters: rotation vector (pitch, yaw, roll; rad), and the logarithm of the scale. known: whether enough corners
         agree.
-    focal_ratio: focal length over the longer side.
+    focal_ratio: focal length over the longer side. centre_ratio: principal point over width and height.
     """
 
     parameters: Float[np.ndarray, "n 4"]
     known: Bool[np.ndarray, "n"]
     focal_ratio: float
+    centre_ratio: tuple[float, float] = _MIDDLE
 
     def to_stabilised_camera(self, size_px: tuple[int, int]) -> Float[np.ndarray, "k 3 3"]:
         """Return homographies from the frames whose motion is known to the picture of a camera that stands still.
 
         Its orientation is the median one. They act on pixels, centres at +0.5. size_px: width and height.
         """
-        view, known = _View(self.focal_ratio * max(size_px), *size_px), self.parameters[self.known]
+        view, known = _View.of(size_px, self.focal_ratio, self.centre_ratio), self.parameters[self.known]
         stabilised = view.homography(np.median(known, axis=0))
         return np.stack([stabilised @ np.linalg.inv(view.homography(row)) for row in known])
 
 
 class _View(NamedTuple):
-    """Focal length and size of a picture, px; the principal point is its centre."""
+    """Focal length and principal point of a picture, px."""
 
     focal_px: float
-    width: int
-    height: int
+    centre_px: tuple[float, float]
+
+    @classmethod
+    def of(cls, size_px: tuple[int, int], focal_ratio: float, centre_ratio: tuple[float, float]) -> _View:
+        """See `CameraMotion`; size_px: width and height."""
+        (width, height), (x, y) = size_px, centre_ratio
+        return cls(focal_ratio * max(size_px), (x * width, y * height))
 
     def homography(self, parameters: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
         """Return where a camera that turns and scales its picture sees the pixels of the reference."""
-        scale, centre = np.exp(parameters[3]), (self.width / 2.0, self.height / 2.0)
+        scale, centre = np.exp(parameters[3]), self.centre_px
         to_pixels = np.array([[self.focal_px, 0.0, centre[0]], [0.0, self.focal_px, centre[1]], [0.0, 0.0, 1.0]])
         matrix: np.ndarray = to_pixels @ np.diag([scale, scale, 1.0]) @ cv2.Rodrigues(parameters[:3])[0]
         return matrix @ np.linalg.inv(to_pixels)
 
     def derivatives(self, points_px: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2 4"]:
         """Return by how many pixels points move with each parameter, for small angles."""
-        x, y = (points_px - (self.width / 2.0, self.height / 2.0)).T / self.focal_px
+        x, y = (points_px - self.centre_px).T / self.focal_px
         right = np.stack([-x * y, 1.0 + x * x, -y, x], axis=-1)
         down = np.stack([-1.0 - y * y, x * y, x, y], axis=-1)
         return self.focal_px * np.stack([right, down], axis=1)
@@ -93,16 +100,18 @@ class _Track(NamedTuple):
 
 
 def estimate_camera_motion(
-    gray: UInt8[np.ndarray, "n h w"], person: Bool[np.ndarray, "n h w"], focal_ratio: float | None
+    gray: UInt8[np.ndarray, "n h w"],
+    person: Bool[np.ndarray, "n h w"],
+    focal_ratio: float | None,
+    centre_ratio: tuple[float, float] = _MIDDLE,
 ) -> CameraMotion:
     """Return the motion of the camera. person: dilated masks; corners in them do not count.
 
     focal_ratio: focal length over the longer side; None: that of `FOCAL_RATIOS` which explains the corners best.
+    centre_ratio: principal point over width and height.
     """
     (height, width), middle = gray.shape[1:], FOCAL_RATIOS[len(FOCAL_RATIOS) // 2]
-    views = {
-        ratio: _View(ratio * max(height, width), width, height) for ratio in (*FOCAL_RATIOS, focal_ratio or middle)
-    }
+    views = {ratio: _View.of((width, height), ratio, centre_ratio) for ratio in (*FOCAL_RATIOS, focal_ratio or middle)}
     tracks = _track_corners(gray, person, views[focal_ratio or middle])
     if focal_ratio is None:
         sampled = [tracks[k] for k in evenly_spaced(len(tracks), _FOCAL_FRAMES)]
@@ -110,7 +119,7 @@ def estimate_camera_motion(
         focal_ratio = min(errors, key=errors.__getitem__)
     fits = [_fit(one, views[focal_ratio])[0] for one in tracks]
     parameters = np.stack([np.zeros(4) if fit is None else fit for fit in fits])
-    return CameraMotion(parameters, np.array([fit is not None for fit in fits]), focal_ratio)
+    return CameraMotion(parameters, np.array([fit is not None for fit in fits]), focal_ratio, centre_ratio)
 
 
 def _track_corners(gray: UInt8[np.ndarray, "n h w"], person: Bool[np.ndarray, "n h w"], view: _View) -> list[_Track]:
@@ -136,22 +145,26 @@ def _track_corners(gray: UInt8[np.ndarray, "n h w"], person: Bool[np.ndarray, "n
     return tracks
 
 
-def stabilise_detections(detections: Detections, focal_px: float | None) -> Detections:
+def stabilise_detections(
+    detections: Detections, focal_px: float | None, centre_px: tuple[float, float] | None = None
+) -> Detections:
     """Return the detections in stabilised pictures.
 
     Frames in which the person would be cut off, or whose motion is unknown, are left out. The detections are returned
     as they are if the scene behind the person does not move, if these are many frames, or if the scene does not stand
     still afterwards, because it is no turning camera that changes it.
 
-    focal_px: focal length from the metadata of the recording, in pixels of the pictures that are kept.
+    focal_px: focal length, in pixels of the pictures that are kept; None: unknown.
+    centre_px: principal point in these pictures; None: their middle.
     """
     before = sample_scene_changes(detections)[1].mean()
     if before <= MAX_MOVED_FRACTION:
         return detections
     size_px = detections.width, detections.height
     focal_ratio = None if focal_px is None else focal_px / max(size_px)
+    centre_ratio = _MIDDLE if centre_px is None else (centre_px[0] / size_px[0], centre_px[1] / size_px[1])
     person = dilated_person_masks(detections.person_masks)
-    motion = estimate_camera_motion(detections.gray_thumbnails, person, focal_ratio)
+    motion = estimate_camera_motion(detections.gray_thumbnails, person, focal_ratio, centre_ratio)
     if motion.known[detections.found].mean() < _MIN_KEPT_SHARE:
         return detections
     to_stabilised = motion.to_stabilised_camera(size_px)

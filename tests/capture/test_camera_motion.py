@@ -1,5 +1,6 @@
 """A hand-held camera, against rays that are turned by known angles, and pictures that it took of a painted wall."""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -231,7 +232,7 @@ def test_written_frames_and_supplied_masks_are_stabilised(tmp_path):
         np.testing.assert_array_equal(read_rgb(image_path(tmp_path / "out", k))[:, moved:], images[k][:, : 30 - moved])
 
 
-def test_a_moving_camera_is_told_unless_the_camera_is_supplied(tmp_path):
+def test_a_moving_camera_is_told_unless_its_place_is_supplied(tmp_path):
     shaken = recording(true_motion())
     for k in range(2):
         write_rgb(tmp_path / f"{k}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
@@ -240,9 +241,34 @@ def test_a_moving_camera_is_told_unless_the_camera_is_supplied(tmp_path):
     assert stabilised.to_stabilised is not None
     assert moved_px > 10.0
     assert [f"moves, its picture by up to {moved_px:.0f} px" in text for text in take_warnings()] == [True]
-    (tmp_path / "camera.json").write_text('{"fx": 384, "fy": 384, "cx": 160, "cy": 90}')
+    intrinsics = {"fx": 384, "fy": 384, "cx": 160, "cy": 90}
+    (tmp_path / "camera.json").write_text(json.dumps({**intrinsics, "world_to_camera": np.eye(4).tolist()}))
     assert stabilise_camera(shaken, source, load_user_files(tmp_path, source)) == (shaken, 0.0)
     assert take_warnings() == []
+
+
+def test_supplied_intrinsics_hold_for_stabilised_pictures(tmp_path):
+    """Pictures without their left 80 of 320 px, half as large as those of the recording."""
+    cut_px, ratio, motion = 80, 1.0, true_motion(size=1.5)
+    shaken = recording(motion, ratio)
+    shaken = replace(
+        shaken,
+        gray_thumbnails=shaken.gray_thumbnails[:, :, cut_px:],
+        person_masks=shaken.person_masks[:, :, cut_px:],
+        width=WIDTH - cut_px,
+        scale=0.5,
+    )
+    write_rgb(tmp_path / "0.png", np.zeros((2 * HEIGHT, 2 * shaken.width, 3), np.uint8))
+    intrinsics = {"fx": 2 * ratio * WIDTH, "fy": 2 * ratio * WIDTH, "cx": WIDTH - 2 * cut_px, "cy": HEIGHT}
+    (tmp_path / "camera.json").write_text(json.dumps(intrinsics))
+    source = open_frame_source(tmp_path)
+    stabilised, _ = stabilise_camera(shaken, source, load_user_files(tmp_path, source))
+    assert len(take_warnings()) == 1
+    corners = np.array([(x, y) for x in (cut_px, WIDTH) for y in (0, HEIGHT)], dtype=float)
+    for homography, row in zip(stabilised.to_stabilised, motion, strict=True):
+        moved = apply_homography(homography, corners - (cut_px, 0))
+        expected = see_in_median(motion, row, ratio, corners) - (cut_px, 0)
+        np.testing.assert_allclose(moved, expected, atol=0.3)
 
 
 def test_frames_of_unknown_motion_are_told_as_such(tmp_path):
