@@ -18,7 +18,13 @@ from pipeline.capture.detection_checkpoint import load_detections, save_detectio
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.frame_writing import write_frames
-from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input
+from pipeline.capture.input_checks import (
+    MAX_MOVED_FRACTION,
+    assess_input,
+    check_frames_that_differ,
+    check_input,
+    sample_scene_changes,
+)
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
 from pipeline.capture.worker_pool import start_worker_pool
@@ -33,6 +39,9 @@ CHECKPOINT = "checkpoint_detections.safetensors"
 _PEOPLE_COUNT_FRAMES = 6
 _CANDIDATES_PER_FRAME = 1.25
 """Frames in which the person is detected for each that is used: detections tell motion and duplicates better."""
+
+_MAX_MOVING_NOISE = 1.0
+"""Largest noise of a recording whose scene moves, levels: three times that of the real clips, which is rounding."""
 
 
 class Config(BaseConfig):
@@ -80,7 +89,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
             save_detections(out / CHECKPOINT, detections)
         check_input(detections, source.path, config.min_frames)
         detections, moved_px = stabilise_camera(detections, source, user_files)
-        noise = selection.estimate_noise_level(detections.gray_thumbnails)
+        noise = comparison_noise(detections)
         if user_files.split is None:
             selected = select_capture_frames(detections, source.path, config, noise)
         else:
@@ -136,6 +145,14 @@ def stabilise_camera(detections: Detections, source: FrameSource, user_files: Us
         f"{dropped}; film with a stand for more detail"
     )
     return stabilised, motion_px
+
+
+def comparison_noise(detections: Detections) -> float:
+    """Return the noise with which frames are compared, levels of 255; what moves the whole scene is no noise."""
+    noise = selection.estimate_noise_level(detections.gray_thumbnails)
+    if noise > _MAX_MOVING_NOISE and sample_scene_changes(detections)[1].mean() > MAX_MOVED_FRACTION:
+        return _MAX_MOVING_NOISE
+    return noise
 
 
 def select_detection_frames(source: FrameSource, user_files: UserFiles, config: Config) -> tuple[Sequence[int], int]:

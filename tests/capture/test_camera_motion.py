@@ -24,7 +24,7 @@ from pipeline.capture.video import open_frame_source
 from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.progress import take_warnings
 from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
-from stages.frames import stabilise_camera
+from stages.frames import comparison_noise, stabilise_camera
 from tests.capture.test_input_checks import make_detections
 
 WIDTH, HEIGHT, FOCAL_RATIO = 320, 180, 1.2
@@ -280,3 +280,12 @@ def test_frames_of_unknown_motion_are_told_as_such(tmp_path):
     np.testing.assert_array_equal(stabilised.frame_index, np.delete(np.arange(COUNT), 4))
     (text,) = take_warnings()
     assert "stabilised, 1 left out, which would cut off the person or whose motion is unknown; film" in text
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_only_noise_of_a_still_scene_counts_as_large(moves):
+    """Noise of 4 levels, of which the mean difference of two pictures is 4 * 2 / sqrt(pi)."""
+    detections = recording(true_motion(size=1.0 if moves else 0.0))
+    noisy = detections.gray_thumbnails + np.random.default_rng(8).normal(0.0, 4.0, (COUNT, HEIGHT, WIDTH))
+    noise = comparison_noise(replace(detections, gray_thumbnails=np.clip(np.rint(noisy), 0, 255).astype(np.uint8)))
+    assert noise == pytest.approx(1.0 if moves else 8.0 / np.sqrt(np.pi), rel=0.1)
