@@ -95,8 +95,8 @@ def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UIn
     Raises:
         UserError: the number of masks differs from the number of images.
     """
-    found = (path for path in folder.iterdir() if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES))
-    files = sorted(found, key=natural_sort_key)
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    files = sorted((path for path in visible if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES)), key=natural_sort_key)
     by_stem = {path.stem: path for path in files}
     if source.files and all(image.stem in by_stem for image in source.files):
         files = [by_stem[image.stem] for image in source.files]

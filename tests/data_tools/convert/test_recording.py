@@ -17,6 +17,7 @@ def test_masks_of_a_video_are_in_order(tmp_path):
     (tmp_path / "masks").mkdir()
     for k, mask in enumerate(sample_data.masks(6)):
         write_gray(tmp_path / "masks" / f"{k}.png", 255 * mask)
+        (tmp_path / "masks" / f"._{k}.png").touch()  # metadata of macOS
     source = open_frame_source(tmp_path / "walk.mp4")
     read = mask_folder_reader(tmp_path / "masks", source)
     for k, mask in enumerate(sample_data.masks(6)):
