@@ -37,14 +37,19 @@ EXPRESSIONS: Mapping[str, tuple[str, Mapping[str, float]]] = {
 }
 """VRM 1.0's presets, with VRM 0.x's name of each, and the weights of the morph targets."""
 
+_USED_MORPHS = frozenset(name for _, weights in EXPRESSIONS.values() for name in weights)
+
 GAZE_FULL_DEG = 30.0
 """Angle of the gaze at which an expression of looking has its full weight."""
 
 
 def morph_names(file: GlbFile) -> list[str]:
-    """Return the names of the morph targets of the first mesh; empty without morph targets."""
+    """Return the names of the morph targets of the first mesh; empty if it lacks one that `EXPRESSIONS` use.
+
+    An avatar without a moving face may have others: those of its shape.
+    """
     names: list[str] = file.gltf["meshes"][0].get("extras", {}).get("targetNames", [])
-    return names
+    return names if _USED_MORPHS.issubset(names) else []
 
 
 def expressions_vrm1(names: Sequence[str], node: int) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pipeline.avatar.formats.vrm_expressions import EXPRESSIONS
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.template.face.units import VISEMES, load_face_units
+from pipeline.template.reshape import SHAPE_KEYS
 from tests.avatar.formats.anny_avatar import anny_body, anny_glb
 
 META = VrmMeta("avatar", "A. Person", "")
@@ -20,10 +21,8 @@ def names() -> list[str]:
     return [*load_face_units().names, *VISEMES]
 
 
-@pytest.fixture(scope="module")
-def files(names: list[str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, GlbFile]:
+def vrm_files(names: list[str], folder: Path) -> dict[str, GlbFile]:
     """VRM files of an avatar with one sparse morph target for each name."""
-    folder = tmp_path_factory.mktemp("vrm")
     document = GlbWriter.from_file(anny_glb(folder))
     (mesh,) = document.json["meshes"]
     count = document.json["accessors"][mesh["primitives"][0]["attributes"]["POSITION"]]["count"]
@@ -36,6 +35,11 @@ def files(names: list[str], tmp_path_factory: pytest.TempPathFactory) -> dict[st
     (folder / "one.vrm").write_bytes(encode_vrm1(glb, joints, META))
     (folder / "zero.vrm").write_bytes(encode_vrm0(glb, joints, META))
     return {"1.0": GlbFile(folder / "one.vrm"), "0.x": GlbFile(folder / "zero.vrm")}
+
+
+@pytest.fixture(scope="module")
+def files(names: list[str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, GlbFile]:
+    return vrm_files(names, tmp_path_factory.mktemp("vrm"))
 
 
 def test_presets_of_vrm_1_bind_the_named_targets(files: dict[str, GlbFile], names: list[str]) -> None:
@@ -63,3 +67,14 @@ def test_an_avatar_without_morph_targets_has_no_expressions(tmp_path: Path) -> N
     vrm = GlbFile(tmp_path / "one.vrm").gltf["extensions"]["VRMC_vrm"]
     assert vrm["expressions"]["preset"] == {}
     assert vrm["lookAt"]["type"] == "bone"
+
+
+def test_an_avatar_with_morph_targets_of_its_shape_only_has_no_expressions(tmp_path: Path) -> None:
+    """As the export with shape keys writes it where the face does not move."""
+    files = vrm_files(list(SHAPE_KEYS), tmp_path)
+    one, zero = files["1.0"].gltf["extensions"]["VRMC_vrm"], files["0.x"].gltf["extensions"]["VRM"]
+    assert (one["expressions"]["preset"], one["lookAt"]["type"]) == ({}, "bone")
+    assert (zero["blendShapeMaster"]["blendShapeGroups"], zero["firstPerson"]["lookAtTypeName"]) == ([], "Bone")
+    for file in files.values():
+        (mesh,) = file.gltf["meshes"]
+        assert mesh["extras"]["targetNames"] == list(SHAPE_KEYS)
