@@ -45,15 +45,16 @@ def read_painting(path: Path) -> Painting:
 
 
 def read_mask(path: Path) -> Float[np.ndarray, "s s"]:
-    """Read a mask in the layout of a diffuse map: 1 (white) replaces, grey blends.
+    """Read a mask in the layout of a diffuse map: 1 (white) replaces, grey blends, transparent keeps.
 
     Raises:
         UserError: the file cannot be read, is not a square of `MIN_SIDE_PX` to `MAX_SIDE_PX`, or is black.
     """
     mask = to_float(read_gray(path))
     _check_layout(path, mask)
+    mask = mask * to_float(read_alpha(path))
     if not mask.any():
-        raise UserError(f"mask {path} is black everywhere; paint what is replaced white")
+        raise UserError(f"mask {path} is black or transparent everywhere; paint what is replaced white")
     return mask
 
 

@@ -19,6 +19,7 @@ from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.files import load_texture, save_texture
 from pipeline.texture.light import Highlights
+from pipeline.texture.painting import read_mask
 from tests.data_tools.exported_run import write_exported_run
 from tests.field.scene import PaintedScene
 from tests.stages.painted_run import known_registration
@@ -118,12 +119,27 @@ def test_the_other_persons_colours_are_where_the_mask_is_white(run: Path, scene:
     assert not (other / "retexture").exists()
 
 
+def test_white_of_a_mask_counts_where_it_is_opaque(tmp_path: Path) -> None:
+    pixels = np.full((SIDE_PX, SIDE_PX, 4), 255, np.uint8)
+    pixels[:100, :, :3], pixels[:, :50, 3], pixels[:, 50:70, 3] = 102, 0, 51
+    write_rgba(tmp_path / "layer.png", pixels)
+    mask = read_mask(tmp_path / "layer.png")
+    assert not mask[:, :50].any()
+    for columns, alpha in ((slice(50, 70), 0.2), (slice(70, None), 1.0)):
+        np.testing.assert_allclose(mask[:100, columns], 0.4 * alpha, atol=1e-6)
+        np.testing.assert_allclose(mask[100:, columns], alpha, atol=1e-6)
+    pixels[..., 3] = 0
+    write_rgba(tmp_path / "layer.png", pixels)
+    with pytest.raises(UserError, match="transparent everywhere; paint what is replaced white"):
+        read_mask(tmp_path / "layer.png")
+
+
 def test_bad_masks_and_runs_are_named(run: Path, tmp_path: Path) -> None:
     black, paint = tmp_path / "black.png", tmp_path / "paint.png"
     write_rgb(black, np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
     write_rgb(paint, np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
     for arguments, words in (
-        (["--from", str(run), "--mask", str(black)], "black everywhere"),
+        (["--from", str(run), "--mask", str(black)], "black or transparent everywhere"),
         (["--from", str(tmp_path)], "has no finished export"),
         (["--diffuse", str(paint), "--mask", str(black)], "--mask is for"),
     ):
