@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from os.path import commonprefix
 from typing import Literal
 
 from pipeline.avatar.vrm_bones import human_bones
@@ -46,8 +47,15 @@ def rig_joint_name(name: str, rig: RigName) -> str:
 def match_names(names: Sequence[str]) -> dict[str, int]:
     """Return the index of each joint of a skeleton by Mixamo's name, in the rig whose names match most of its joints.
 
-    Case, namespaces (`mixamorig:`) and characters other than letters and digits do not count.
+    Case, namespaces (`mixamorig:`), characters other than letters and digits and a prefix that all joints share do not
+    count.
     """
+    whole = _match_whole_names(names)
+    prefix = len(commonprefix(names))
+    return max(whole, _match_whole_names([name[prefix:] for name in names]), key=len) if prefix else whole
+
+
+def _match_whole_names(names: Sequence[str]) -> dict[str, int]:
     index_of = {_normalise(name): index for index, name in reversed(list(enumerate(names)))}
     tables: list[Mapping[str, tuple[str, ...]]] = [
         {name: (rig_name,) for name, rig_name in _rig_names(rig).items()} for rig in _rigs()

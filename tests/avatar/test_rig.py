@@ -214,7 +214,8 @@ def test_names_of_joints() -> None:
 def test_joints_are_matched_in_every_rig(rig: str, bare: Body) -> None:
     own = tuple(rig_joint_name(name, rig) for name in bare.joint_names)
     spelt = tuple(name.replace(":", "").upper() for name in own)
-    for names in (own, spelt, ("Armature", *own)):
+    robot = tuple(f"Robot-07_{name}" for name in own)
+    for names in (own, spelt, ("Armature", *own), robot):
         offset = len(names) - len(own)
         assert match_names(names) == {name: joint + offset for joint, name in enumerate(bare.joint_names)}
 
