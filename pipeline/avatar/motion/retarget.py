@@ -60,6 +60,9 @@ _REQUIRED_JOINTS = (
 _T_POSE_COSINE = 0.97
 """Mean cosine between the limbs of the file's rest pose and of a T-pose above which the rest pose is a T-pose."""
 
+_UPRIGHT_COSINE = np.cos(np.radians(25.0))
+"""Of legs to the trunk of a rest pose that stands, and of a recorded trunk to its up axis."""
+
 _MAX_TWIST_RAD = np.radians(15.0)
 """Twist by which the axes of elbow or knee may contradict the reference pose: no joint bends about one axis exactly."""
 
@@ -95,7 +98,7 @@ def retarget_with_contacts(
     world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
     reference = _reference_pose(bvh_motion, body, recorded_joint_of, world, positions)
     axes = _body_axes(positions, recorded_joint_of)
-    bvh_to_world = _bvh_to_world(axes.mean(axis=0), axes[0])
+    bvh_to_world = _bvh_to_world(_up_axis(bvh_motion, recorded_joint_of, axes[:, 1]), axes[0])
     soles = [recorded_joint_of.get(name, recorded_joint_of[name.replace("ToeBase", "Foot")]) for name in SOLE_JOINTS]
     hips = recorded_joint_of["Hips"]
     root = bvh_motion.trajectory(hips) @ bvh_to_world.T
@@ -179,12 +182,40 @@ def _body_axes(positions: Float[np.ndarray, "k j 3"], recorded_joint_of: dict[st
     return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
-def _bvh_to_world(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Return W: it maps the mean up axis of the recording to +Y and the front of the first frame to +Z."""
-    up = np.zeros(3)
-    axis = int(np.abs(mean_basis[1]).argmax())
-    up[axis] = np.sign(mean_basis[1, axis])
-    front = first[2] - (first[2] @ up) * up
+def _up_axis(
+    bvh_motion: BvhMotion, recorded_joint_of: dict[str, int], trunk: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "3"]:
+    """Return the axis of the file that is up: of a rest pose that stands, if a recorded trunk is near it.
+
+    Else the axis nearest to the mean trunk: rest poses may be no pose of a person, or have other axes than the motion.
+
+    trunk: unit vectors from the hips to the head, axes of the file.
+    """
+    _, rest = bvh_motion.forward_kinematics(np.tile(np.eye(3), (1, len(bvh_motion.parents), 1, 1)))
+    rest_trunk = _body_axes(rest, recorded_joint_of)[0, 1]
+    ends = [[recorded_joint_of[side + part] for side in ("Left", "Right")] for part in ("UpLeg", "Foot")]
+    legs = rest[0, ends[0]] - rest[0, ends[1]]
+    stands = legs @ rest_trunk > _UPRIGHT_COSINE * np.linalg.norm(legs, axis=1)
+    up = _nearest_axis(rest_trunk)
+    if stands.all() and (trunk @ up).max() > _UPRIGHT_COSINE:
+        return up
+    return _nearest_axis(trunk.mean(axis=0))
+
+
+def _nearest_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the axis of the file, with its sign, nearest to a direction."""
+    axis = int(np.abs(direction).argmax())
+    return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
+
+
+def _bvh_to_world(up: Float[np.ndarray, "3"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return W: it maps `up` to +Y and the front of the first frame to +Z, with its trunk turned up on the short arc.
+
+    The front of a trunk that lies may be vertical itself.
+    """
+    _, trunk, front = first
+    front = front - (front @ up) / max(1.0 + trunk @ up, 1e-9) * (trunk + up)
+    front -= (front @ up) * up
     front /= np.linalg.norm(front)
     return np.stack([np.cross(up, front), up, front])
 

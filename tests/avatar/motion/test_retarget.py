@@ -94,6 +94,40 @@ def test_hips_that_move_below_a_reference_joint_move_the_avatar(bare: Body, turn
     assert np.allclose(joint_positions(bare, one), joint_positions(bare, other), atol=1e-3)
 
 
+def fallen(body: Body, lying: float, pitch_deg: float) -> Motion:
+    """The A-pose stands, falls in a fifth of the time and lies for a part of it; negative pitch: on the back."""
+    frames = 60
+    share = np.clip((np.arange(frames) / (frames - 1) - (0.8 - lying)) / 0.2, 0.0, 1.0)
+    rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (frames, len(body.joint_names), 1))
+    half_rad = np.radians(0.5 * pitch_deg) * share
+    rotations[:, 0, 0], rotations[:, 0, 1] = np.cos(half_rad), np.sin(half_rad)
+    root_m = np.repeat(body.joints_m[:1], frames, axis=0)
+    root_m[:, 1] -= 0.7 * share.astype(np.float32)
+    return Motion(np.arange(frames, dtype=np.int32), np.arange(frames) / 30.0, rotations, root_m)
+
+
+@pytest.mark.parametrize("z_is_up", [False, True])
+@pytest.mark.parametrize(("lying", "pitch_deg"), [(0.2, -90.0), (0.7, -90.0), (0.7, 90.0)])
+def test_a_person_who_lies_most_of_the_time_is_not_turned_upright(
+    lying: float, pitch_deg: float, z_is_up: bool, bare: Body
+) -> None:
+    """Also played backwards, where the first frame has its front up or down, and in a file with all axes turned."""
+    motion, name = fallen(bare, lying, pitch_deg), bare.joint("Head")
+    clip = recorded(bare, motion, 30.0)
+    if z_is_up:
+        turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        rotations = turn @ clip.rotations @ turn.T
+        clip = replace(
+            clip, offsets=clip.offsets @ turn.T, rotations=rotations, root_positions=clip.root_positions @ turn.T
+        )
+    for rows in (slice(None), slice(None, None, -1)):
+        played = replace(clip, rotations=clip.rotations[rows], root_positions=clip.root_positions[rows])
+        found = joint_positions(bare, retarget(played, bare, np.zeros(3), in_place=False))
+        wanted = joint_positions(bare, motion)[rows]
+        trunks = [directions(positions, 0, name) for positions in (found, wanted)]
+        assert np.degrees(np.arccos((trunks[0] * trunks[1]).sum(axis=1).clip(-1, 1))).max() < 6.0
+
+
 def test_alternative_joint_names(bare: Body, turn: Motion) -> None:
     """LeftShoulder is the upper arm in CMU files and the collar bone in Mixamo files."""
     table = {"Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist", "Shoulder": "Collar"}
