@@ -59,13 +59,13 @@ def film_motion(clip: str | None, scene: Scene, in_place: bool = False) -> Motio
     """
     _check_clip(clip)
     if clip is None or clip == TURNTABLE:
-        return turntable_motion(scene.body)
+        return turntable_motion(scene.body, scene.floor_y_m)
     if clip == "capture":
         motion = scene.motion
     elif clip == "idle":
-        motion = idle_motion(scene.body)
+        motion = idle_motion(scene.body, scene.floor_y_m)
     else:
-        motion = play_bvh(Path(clip), scene.body, in_place)
+        motion = play_bvh(Path(clip), scene.body, scene.floor_y_m, in_place)
     resampled = resample_uniformly(motion, FPS)
     if len(resampled.time_s) < MIN_FRAMES:
         length_s = motion.time_s[-1] - motion.time_s[0]

@@ -38,7 +38,6 @@ from pipeline.mesh.files import MeshArtifact
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, write_scene_obj
 
-FLOOR_M = np.zeros(3)
 RIG_POSES = ("a", "t")
 
 
@@ -51,8 +50,8 @@ def main(argv: Sequence[str]) -> None:
     config = export_config(options.run)
     body = load_body(inputs["body"] / "body.npz")
     _check_pose(options, inputs, body)
-    clips = {path.stem: play_bvh(path, body, options.in_place) for path in options.bvh}
     scene = load_scene(inputs, config)
+    clips = {path.stem: play_bvh(path, body, scene.floor_y_m, options.in_place) for path in options.bvh}
     posed = _chosen_pose(options, scene, clips)
     with replaced_folder(options.run / "pose" / name) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
@@ -68,13 +67,17 @@ def planted_motion(scene: Scene) -> Motion:
     """Return the motion of the video at its frame rate, with standing feet held where they were."""
     motion = resample_uniformly(scene.motion, scene.fps)
     contact = find_contacts(sole_positions_m(scene.body, motion), motion.time_s)
-    return plant_feet(scene.body, motion, contact, float(FLOOR_M[1]))
+    return plant_feet(scene.body, motion, contact, scene.floor_y_m)
 
 
-def play_bvh(path: Path, body: Body, in_place: bool = False) -> Motion:
-    """Return a recorded motion of the body on the floor at y = 0, with feet that stand where the recorded feet stand.
+def play_bvh(path: Path, body: Body, floor_y_m: float, in_place: bool = False) -> Motion:
+    """Return a recorded motion of the body on a floor, with feet that stand where the recorded feet stand.
 
-    in_place: remove the horizontal translation; feet are then not held.
+    Args:
+        path: of the .bvh file.
+        body: to be moved.
+        floor_y_m: at which feet stand at their height in the A-pose.
+        in_place: remove the horizontal translation; feet are then not held.
 
     Raises:
         UserError: the file is not a BVH file, lacks a required joint, or has fewer than two frames.
@@ -83,8 +86,8 @@ def play_bvh(path: Path, body: Body, in_place: bool = False) -> Motion:
     if len(recorded.rotations) < 2:
         raise UserError(f"motion {path} has one frame and no duration; supply a clip of at least two frames")
     try:
-        motion, contact = retarget_with_contacts(recorded, body, FLOOR_M, in_place)
-        return motion if in_place else plant_feet(body, motion, contact, float(FLOOR_M[1]))
+        motion, contact = retarget_with_contacts(recorded, body, np.array([0.0, floor_y_m, 0.0]), in_place)
+        return motion if in_place else plant_feet(body, motion, contact, floor_y_m)
     except UserError as error:
         raise UserError(f"motion {path}: {error}") from error
 
@@ -204,7 +207,7 @@ def _chosen_pose(options: argparse.Namespace, scene: Scene, clips: Mapping[str, 
     else:
         rotations = read_pose(Path(options.pose), scene.body)
     motion = Motion(np.zeros(1, np.int32), np.zeros(1), rotations, scene.body.joints_m[:1])
-    return snap_feet_to_floor(scene.body, motion, float(FLOOR_M[1]))
+    return snap_feet_to_floor(scene.body, motion, scene.floor_y_m)
 
 
 def _posed_mesh(scene: Scene, motion: Motion) -> MeshArtifact:

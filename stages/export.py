@@ -25,7 +25,7 @@ from pipeline.avatar.placement import (
 )
 from pipeline.avatar.rig import RestPose, Rig, build_rig
 from pipeline.avatar.rig_names import RigName
-from pipeline.avatar.skinned_avatar import build_skinned_mesh, lowest_vertex_y_m, to_rest_pose
+from pipeline.avatar.skinned_avatar import a_pose_floor_y_m, build_skinned_mesh, lowest_vertex_y_m, to_rest_pose
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -141,7 +141,12 @@ class Scene:
 
     def clips(self) -> dict[str, Motion]:
         """Return the animations of every .glb, by name."""
-        return {"capture": self.motion, "idle": idle_motion(self.body)}
+        return {"capture": self.motion, "idle": idle_motion(self.body, self.floor_y_m)}
+
+    @property
+    def floor_y_m(self) -> float:
+        """See `a_pose_floor_y_m`: for motions made from those of joints."""
+        return a_pose_floor_y_m(self.skinned)
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
@@ -377,7 +382,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=16,
+    version=17,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

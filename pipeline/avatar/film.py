@@ -129,15 +129,18 @@ class FilmView:
         return Ground(first_row, *(values.astype(np.float32) for values in (x_z_m, width_m, strength)))
 
 
-def turntable_motion(body: Body) -> Motion:
-    """Return one turn of the A-pose about the vertical through the hips, at `FPS`; the frame after it is the first."""
+def turntable_motion(body: Body, floor_y_m: float) -> Motion:
+    """Return one turn of the A-pose about the vertical through the hips, at `FPS`; the frame after it is the first.
+
+    floor_y_m: height of the origin of the A-pose.
+    """
     count = round(TURN_S * FPS)
     angle_rad = 2.0 * np.pi * np.arange(count) / count
     axis_angle = torch.zeros(count, 3, dtype=torch.float64)
     axis_angle[:, 1] = torch.from_numpy(angle_rad)
     rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (count, len(body.joint_names), 1))
     rotations[:, 0] = axis_angle_to_quaternion(axis_angle).numpy()
-    root_m = np.tile(body.joints_m[:1].astype(np.float32), (count, 1))
+    root_m = np.tile(body.joints_m[:1] + np.array([0.0, floor_y_m, 0.0], np.float32), (count, 1)).astype(np.float32)
     return Motion(np.arange(count, dtype=np.int32), np.arange(count) / FPS, rotations, root_m)
 
 

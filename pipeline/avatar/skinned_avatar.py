@@ -37,6 +37,14 @@ def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
     return replace(skinned, mesh=Mesh(positions_m, mesh.faces))
 
 
+def a_pose_floor_y_m(skinned: MeshArtifact) -> float:
+    """Return the floor (m) at which feet must stand that are at their height in the A-pose, for soles at y = 0.
+
+    Shoes are below the feet of the body model.
+    """
+    return -float(skinned.mesh.vertices[:, 1].min())
+
+
 def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Return the world height (m) of the lowest vertex of the posed mesh in every frame."""
     weights, vertices = skinned.dense_skin_weights(len(body.joint_names)), torch.from_numpy(skinned.mesh.vertices)

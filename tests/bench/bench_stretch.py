@@ -35,7 +35,7 @@ def main(argv: list[str]) -> None:
         body = load_body(run / "body" / "body.npz")
         print(f"{run.name:24} {'(video)':24} {_row(run, load_motion(run / 'mesh' / 'motion.npz'))}")
         for clip in options.clips:
-            print(f"{run.name:24} {clip.stem:24} {_row(run, play_bvh(clip, body))}")
+            print(f"{run.name:24} {clip.stem:24} {_row(run, play_bvh(clip, body, 0.0))}")
 
 
 def _row(run: Path, motion: Motion) -> str:

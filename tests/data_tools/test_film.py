@@ -49,7 +49,7 @@ def test_a_clip_is_filmed_and_the_export_keeps_its_bytes(run: Path) -> None:
 
 
 def test_the_turntable_turns_once_and_closes(scene: PaintedScene) -> None:
-    motion = turntable_motion(scene.body)
+    motion = turntable_motion(scene.body, 0.0)
     transforms = canonical_to_world(scene.body, motion)
     nose = torch.tensor([0.0, 1.5, 0.1, 1.0])
     places = (transforms[:, 0] @ nose)[:, :3] - torch.from_numpy(motion.root_translation_m)

@@ -10,14 +10,18 @@ import torch
 import trimesh
 
 from data_tools import pose
+from data_tools.film import film_motion
 from data_tools.pose import export_config, main, planted_motion, read_pose
-from pipeline.avatar.motion.feet import joint_positions_m
+from pipeline.avatar.motion.feet import joint_positions_m, lowest_foot_offset_m
+from pipeline.avatar.skinned_avatar import lowest_vertex_y_m
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.bvh import read_bvh
 from pipeline.io.glb import GlbFile
+from pipeline.mesh.files import load_mesh, save_mesh
 from stages.export import STAGE, Config, load_scene
 from tests.field.scene import PaintedScene
 from tests.tools.khronos import validator_issues
@@ -125,6 +129,23 @@ def test_a_clip_without_hips_or_of_one_frame_is_named(run: Path, clip: Path, tmp
     with pytest.raises(UserError, match="several clips with the name wave"):
         main([str(run), "--bvh", str(clip), "--bvh", str(clip)])
     assert not (run / "pose" / "legs").exists()
+
+
+def test_clips_and_poses_stand_on_the_soles_of_the_shoes(run: Path, clip: Path) -> None:
+    """They are 2 cm below the feet of the body model, by whose joints these motions are placed."""
+    whole = load_mesh(run / "mesh")
+    vertices = whole.mesh.vertices.copy()
+    vertices[:, 1] -= 0.02 * (vertices[:, 1] < vertices[:, 1].min() + 0.05)
+    save_mesh(run / "mesh", replace(whole, mesh=Mesh(vertices, whole.mesh.faces)))
+    scene = load_scene({name: run / name for name in STAGE.needs}, Config(face=False))
+    assert scene.floor_y_m == pytest.approx(0.02 - whole.mesh.vertices[:, 1].min(), abs=1e-6)
+    for motion in (scene.clips()["idle"], film_motion("idle", scene), film_motion(None, scene)):
+        np.testing.assert_allclose(lowest_vertex_y_m(scene.skinned, scene.body, motion), 0.0, atol=1e-4)
+    for motion in (film_motion(str(clip), scene), planted_motion(scene)):
+        assert lowest_foot_offset_m(scene.body, motion).min() == pytest.approx(scene.floor_y_m, abs=2e-3)
+    main([str(run), "--pose", "t"])
+    lowest_m = trimesh.load(run / "pose" / "t" / "avatar.obj").vertices[:, 1].min()
+    assert lowest_m == pytest.approx(0.0, abs=1e-4)
 
 
 def test_poses_of_unknown_joints_or_without_four_numbers_are_errors(scene: PaintedScene, tmp_path: Path) -> None:

@@ -33,8 +33,8 @@ _SWAY_RAD = {"Spine": (0.006, 0.012, 0.008), "Head": (0.012, -0.03, -0.008)}
 """Amplitudes (radians about x, y, z) of breathing, and of the sway, which has one period in the clip."""
 
 
-def idle_motion(body: Body) -> Motion:
-    """Return the clip, on the floor at y = 0; its last frame equals its first. Joints that are missing are left out."""
+def idle_motion(body: Body, floor_y_m: float) -> Motion:
+    """Return the clip on a floor; its last frame equals its first. Joints that are missing are left out."""
     time_s = np.arange(round(DURATION_S * FPS) + 1) / FPS
     phase = 2.0 * np.pi * time_s / DURATION_S
     axis_angles = np.zeros((len(time_s), len(body.joint_names), 3))
@@ -47,9 +47,9 @@ def idle_motion(body: Body) -> Motion:
     for name, amplitude in _SWAY_RAD.items():
         _add(axis_angles, body, name, np.sin(phase + [[0.0], [0.7], [1.9]]).T * amplitude)
     rotations = axis_angle_to_quaternion(torch.from_numpy(axis_angles)).numpy()
-    root_m = np.repeat(body.joints_m[:1], len(time_s), axis=0)
+    root_m = np.repeat(body.joints_m[:1] + np.array([0.0, floor_y_m, 0.0], np.float32), len(time_s), axis=0)
     motion = Motion(np.arange(len(time_s), dtype=np.int32), time_s, rotations.astype(np.float32), root_m)
-    return snap_feet_to_floor(body, motion, 0.0) if set(SOLE_JOINTS) <= set(body.joint_names) else motion
+    return snap_feet_to_floor(body, motion, floor_y_m) if set(SOLE_JOINTS) <= set(body.joint_names) else motion
 
 
 def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles_rad: Float[np.ndarray, "#n 3"]) -> None:

@@ -9,7 +9,7 @@ from tests.avatar.avatar_sample import sample_body
 
 
 def test_it_ends_as_it_begins_and_the_feet_stand(bare: Body) -> None:
-    motion = idle_motion(bare)
+    motion = idle_motion(bare, 0.0)
     joints = joint_positions_m(bare, motion)
     np.testing.assert_allclose(joints[-1], joints[0], atol=1e-5)
     speed_m_s = np.linalg.norm(np.diff(joints, axis=0), axis=2) / np.diff(motion.time_s)[:, None]
@@ -20,7 +20,7 @@ def test_it_ends_as_it_begins_and_the_feet_stand(bare: Body) -> None:
 
 
 def test_shoulders_rise_with_every_breath_and_arms_hang(bare: Body) -> None:
-    motion = idle_motion(bare)
+    motion = idle_motion(bare, 0.0)
     joints = joint_positions_m(bare, motion)
     height_m = joints[:, bare.joint("LeftArm"), 1] + joints[:, bare.joint("RightArm"), 1]
     rises = np.flatnonzero((height_m[1:-1] > height_m[:-2]) & (height_m[1:-1] >= height_m[2:]))
@@ -35,5 +35,5 @@ def test_shoulders_rise_with_every_breath_and_arms_hang(bare: Body) -> None:
 
 
 def test_a_skeleton_without_arms_and_legs_has_one_too() -> None:
-    motion = idle_motion(sample_body())
+    motion = idle_motion(sample_body(), 0.0)
     assert np.ptp(motion.rotations_wxyz, axis=0).max() > 1e-3
