@@ -29,6 +29,9 @@ from pipeline.template.texture_exchange import RegisteredSurface, exchanged_map
 from pipeline.texture.files import ATLAS, TextureArtifact, load_texture
 from pipeline.texture.painting import Painting, enlarge_maps, paint_over, read_mask, read_painting, resize_map
 
+_FOLDERS_OF_MAPS = ("texture", "export", "retexture", "stylise", "reshape", "pose")
+"""In a run: maps lie in them, or in their folders, in the layout of its texture."""
+
 
 def main(argv: Sequence[str]) -> None:
     """Write one edited avatar."""
@@ -71,12 +74,15 @@ def fit_painting(painting: Painting, path: Path, run: Path, texture: TextureArti
 
 
 def run_of_map(path: Path) -> Path | None:
-    """Return the run whose texture, or an edit of it, a map lies in; None for a map elsewhere."""
+    """Return the run whose texture, a copy or an edit of it, a map lies in; None for a map elsewhere.
+
+    Maps of the wrapped template are none of these: they have its layout in every run.
+    """
     folder = path.resolve().parent
     candidates = (folder.parent, folder.parent.parent)
     names = (folder.name, folder.parent.name)
     for run, name in zip(candidates, names, strict=True):
-        if name in ("texture", "retexture", "stylise") and (run / "texture" / ATLAS).is_file():
+        if name in _FOLDERS_OF_MAPS and (run / "texture" / ATLAS).is_file() and not path.name.startswith("wrapped_"):
             return run
     return None
 

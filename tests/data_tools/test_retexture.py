@@ -1,5 +1,6 @@
 """The command retexture on a run with known mesh, motion and texture."""
 
+import shutil
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_tools.retexture import main, same_places
+from data_tools.retexture import fit_painting, main, run_of_map, same_places
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.geometry.atlas import rasterize_texels
@@ -19,7 +20,7 @@ from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.files import load_texture, save_texture
 from pipeline.texture.light import Highlights
-from pipeline.texture.painting import read_mask
+from pipeline.texture.painting import Painting, read_mask
 from tests.data_tools.exported_run import write_exported_run
 from tests.field.scene import PaintedScene
 from tests.stages.painted_run import known_registration
@@ -181,6 +182,21 @@ def test_the_map_of_another_person_fits_on_the_templates_layout_only(
     written_uv = glb.accessor(attributes["TEXCOORD_0"]) * np.float32([1, -1]) + np.float32([0, 1])
     distinct = [np.unique(uv.round(5), axis=0) for uv in (written_uv, load_texture(run / "texture").atlas.uv)]
     np.testing.assert_allclose(*distinct, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "place", ["export/avatar_diffuse.png", "reshape/tall/avatar_diffuse.png", "pose/t/avatar_diffuse.png"]
+)
+def test_copies_of_another_persons_map_are_recognised(run: Path, tmp_path: Path, place: str) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(run / "texture", other / "texture")
+    (other / place).parent.mkdir(parents=True)
+    paint = Painting(np.ones((SIDE_PX, SIDE_PX, 3), np.float32), np.ones((SIDE_PX, SIDE_PX), np.float32))
+    with pytest.raises(UserError, match="has the layout of .*other, and .* one of its own"):
+        fit_painting(paint, other / place, run, load_texture(run / "texture"))
+    assert run_of_map(other / place) == other
+    assert run_of_map(other / "export" / "wrapped_diffuse.png") is None
+    assert fit_painting(paint, run / place, run, load_texture(run / "texture")) is paint
 
 
 def test_texels_of_two_people_on_the_templates_layout_are_exchanged_as_they_are(run: Path, scene: PaintedScene) -> None:
