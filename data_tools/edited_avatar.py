@@ -7,26 +7,22 @@ from pathlib import Path
 from data_tools.folder import replaced_folder
 from data_tools.pose import export_config
 from pipeline.avatar.skinned_avatar import to_rest_pose
-from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.texture.files import (
-    DIFFUSE,
-    NORMAL,
-    ROUGHNESS,
-    SPECULAR,
-    TextureArtifact,
-    save_normal_map,
-    save_roughness_map,
-)
+from pipeline.core.manifest import read_manifest
+from pipeline.texture.files import DIFFUSE, TextureArtifact, TextureFormat, save_maps
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, make_face, write_scene_obj
 
 
 @dataclass(frozen=True)
 class EditableAvatar:
-    """A finished run as its export shows it; `scene` has no moving face, which is made of the edited map."""
+    """A finished run as its export shows it; `scene` has no moving face, which is made of the edited map.
+
+    texture_format: of the maps of its texture stage.
+    """
 
     scene: Scene
     config: export.Config
+    texture_format: TextureFormat
 
 
 def load_editable_avatar(run: Path) -> EditableAvatar:
@@ -37,7 +33,10 @@ def load_editable_avatar(run: Path) -> EditableAvatar:
     """
     config = export_config(run)
     inputs = {name: run / name for name in export.STAGE.needs}
-    return EditableAvatar(load_scene(inputs, config.model_copy(update={"face": False})), config)
+    manifest = read_manifest(run / "texture")
+    texture_format: TextureFormat = manifest.config.get("format", "png8") if manifest else "png8"
+    scene = load_scene(inputs, config.model_copy(update={"face": False}))
+    return EditableAvatar(scene, config, texture_format)
 
 
 def write_edited_avatar(
@@ -51,10 +50,7 @@ def write_edited_avatar(
     face = make_face(scene.body, scene.template, scene.skinned, texture) if config.face else None
     edited = replace(scene, texture=texture, face=face)
     with replaced_folder(out) as part:
-        write_rgb(part / DIFFUSE, to_uint8(texture.diffuse))
-        write_gray(part / SPECULAR, to_uint8(texture.specular))
-        save_normal_map(part / NORMAL, texture)
-        save_roughness_map(part / ROUGHNESS, texture)
+        save_maps(part, texture, avatar.texture_format)
         (part / "avatar.glb").write_bytes(encode_scene(edited, config, edited.clips()))
         write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig))
     report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

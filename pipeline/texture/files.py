@@ -53,12 +53,7 @@ class TextureArtifact:
 
 
 def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
-    """Write the atlas and the maps into `folder`; `load_texture` is the inverse up to the precision of the format.
-
-    Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats; its
-    normal and roughness maps, whose values are no colours, are PNG with 16 bits. Without a normal map, that file is one
-    flat texel; without a roughness map, one texel of the roughness of the lobe.
-    """
+    """Write the atlas and the maps into `folder`; `load_texture` is the inverse up to the precision of the format."""
     atlas, cut = texture.atlas, texture.cut
     arrays = {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv}
     if cut is not None:
@@ -68,6 +63,18 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
             "cut_faces": cut.faces.astype(np.int32),
         }
     save_npz(folder / ATLAS, arrays)
+    save_maps(folder, texture, texture_format)
+    write_gray(folder / COVERAGE, texture.coverage)
+    save_light(folder / LIGHT, texture.light, texture.highlights)
+
+
+def save_maps(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
+    """Write the diffuse, specular, normal and roughness maps.
+
+    Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats; its
+    normal and roughness maps, whose values are no colours, are PNG with 16 bits. Without a normal map, that file is one
+    flat texel; without a roughness map, one texel of the roughness of the lobe.
+    """
     for name, values in ((DIFFUSE, texture.diffuse), (SPECULAR, texture.specular)):
         write = write_rgb if values.ndim == 3 else write_gray
         write(folder / name, to_uint16(values) if texture_format == "png16" else to_uint8(values))
@@ -75,8 +82,6 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
             write((folder / name).with_suffix(".exr"), values)
     save_normal_map(folder / NORMAL, texture, texture_format)
     save_roughness_map(folder / ROUGHNESS, texture, texture_format)
-    write_gray(folder / COVERAGE, texture.coverage)
-    save_light(folder / LIGHT, texture.light, texture.highlights)
 
 
 def save_normal_map(path: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:

@@ -11,10 +11,10 @@ from PIL import Image
 
 from data_tools.retexture import fit_painting, main, run_of_map, same_places
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import digest_files
+from pipeline.core.manifest import Manifest, digest_files, write_manifest
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_gray, read_rgb, write_rgb, write_rgba
+from pipeline.io.image import read_gray, read_rgb, read_rgb_float, to_uint16, write_rgb, write_rgba
 from pipeline.mesh.files import load_mesh
 from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
@@ -65,6 +65,24 @@ def test_paint_keeps_highlights_and_their_roughness(run: Path, tmp_path: Path) -
     rows = np.abs(np.arange(SIDE_PX) - SIDE_PX // 2) > SIDE_PX // 16
     for pixels in (embedded, read_gray(out / "roughness.png"), read_gray(out / "avatar_roughness.png")):
         assert (pixels[:, :SIDE_PX] == expected)[rows].all()
+
+
+@pytest.mark.parametrize("texture_format", ["png16", "exr"])
+def test_edited_maps_have_the_format_of_the_texture(run: Path, tmp_path: Path, texture_format: str) -> None:
+    """A ramp of 16 bits in dark tones comes back with its steps, in the folder and in the maps of avatar.obj."""
+    save_texture(run / "texture", load_texture(run / "texture"), texture_format)
+    manifest = Manifest("texture", 1, "", {"format": texture_format}, {}, {}, {}, 0.0, 0.0)
+    write_manifest(manifest, run / "texture" / "manifest.json")
+    ramp = np.linspace(0.2, 0.25, SIDE_PX, dtype=np.float32)
+    paint = np.repeat(np.repeat(ramp[None, :, None], SIDE_PX, axis=0), 3, axis=2)
+    write_rgb(tmp_path / "ramp.png", to_uint16(paint))
+    main([str(run), "--diffuse", str(tmp_path / "ramp.png")])
+    out, on_charts = run / "retexture" / "ramp", covered(run, SIDE_PX)
+    suffix = ".exr" if texture_format == "exr" else ".png"
+    for name in ("diffuse", "avatar_diffuse"):
+        pixels = read_rgb_float(out / f"{name}{suffix}")
+        np.testing.assert_allclose(pixels[on_charts], paint[on_charts], atol=2e-4)
+    assert f"avatar_diffuse{suffix}" in (out / "avatar.mtl").read_text()
 
 
 def test_alpha_says_where_the_paint_applies(run: Path, tmp_path: Path) -> None:
