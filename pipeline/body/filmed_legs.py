@@ -175,7 +175,7 @@ def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: M
         pose[joint] @ torch.from_numpy(np.append(body.joints_m[joint], 1.0)).to(pose)
         for joint in map(body.joint, names)
     ]
-    px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale
+    px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
     hip_px, knee_px = px[:2].mean(), px[2:].mean()
     return [int(hip_px + height * (knee_px - hip_px)) for height in HEIGHTS]
 

@@ -61,14 +61,14 @@ SKIN_CHUNK = 8
 class MaskWindow:
     """Mask of one frame in its matching window.
 
-    left_px, top_px: corner of the window in the image. scale: window pixels per image pixel, across and down.
+    left_px, top_px: corner of the window in the image. scale_xy: window pixels per image pixel, across and down.
     distance: signed distance to the outline (window pixels, positive outside); normal: its unit gradient (x, y).
     outline: pixels (row, column) of the outline. person_px: height of the person in window pixels.
     """
 
     left_px: int
     top_px: int
-    scale: Float[np.ndarray, "2"]
+    scale_xy: Float[np.ndarray, "2"]
     mask: Bool[np.ndarray, "h w"]
     distance: Float[np.ndarray, "h w"]
     normal: Float[np.ndarray, "h w 2"]
@@ -182,7 +182,7 @@ def rasterise_in_window(
     vertices_world: metres.
     """
     vertices_px, depth_m = project(vertices_world, camera)
-    corner, scale = vertices_px.new_tensor([window.left_px, window.top_px]), vertices_px.new_tensor(window.scale)
+    corner, scale = vertices_px.new_tensor([window.left_px, window.top_px]), vertices_px.new_tensor(window.scale_xy)
     height, width = window.mask.shape
     face_id, barycentric, _ = rasterize((vertices_px - corner) * scale, depth_m, faces, height, width)
     return BodyRaster(face_id.numpy(), barycentric.numpy())
@@ -297,7 +297,7 @@ def match_silhouettes(
         face = torch.from_numpy(body_raster.face_id[rows, columns])
         corners[frame, :count] = model.faces[face].long()
         barycentric[frame, :count] = torch.from_numpy(body_raster.barycentric[rows, columns]).double()
-        target[frame, :count] = torch.from_numpy(pairs.target / window.scale + [window.left_px, window.top_px])
+        target[frame, :count] = torch.from_numpy(pairs.target / window.scale_xy + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
         shown = joint_weight[frame, face_joint[face]]
         weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_WEIGHT / max(used, 1))) * shown

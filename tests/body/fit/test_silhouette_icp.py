@@ -63,15 +63,15 @@ def test_the_scale_of_a_window_is_that_of_its_mask() -> None:
     """All 333 x 437 px are the window, whose size is rounded to whole pixels: its scale is not quite 240 / 437."""
     window = crop_mask_window(np.full((437, 333), 255, np.uint8))
     assert window is not None
-    assert np.allclose(window.scale * [333, 437], window.mask.shape[::-1], rtol=1e-12)
+    assert np.allclose(window.scale_xy * [333, 437], window.mask.shape[::-1], rtol=1e-12)
 
 
 def test_pairs_of_a_shifted_disc_recover_the_shift() -> None:
     window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
     shift = np.array([3.0, 0.0])
-    middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale
-    body_mask = disc(30.0 * window.scale[0], *(middle + shift), size=window.mask.shape[0])[:, : window.mask.shape[1]]
+    middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale_xy
+    body_mask = disc(30.0 * window.scale_xy[0], *(middle + shift), size=window.mask.shape[0])[:, : window.mask.shape[1]]
     pairs = find_correspondences(window, body_mask, np.zeros_like(body_mask))
     used = pairs.weight > 0
     gap = ((pairs.pixel[:, ::-1] + 0.5 - pairs.target) * pairs.normal).sum(1)[used]
@@ -85,7 +85,7 @@ def test_pairs_inside_the_mask_weigh_less_than_outside() -> None:
     """Clothes extend the mask beyond the body; the body itself never extends beyond the mask."""
     window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
-    middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale
+    middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale_xy
     weights = []
     for radius in (27.0, 33.0):
         body_mask = disc(radius, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
