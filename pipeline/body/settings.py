@@ -19,8 +19,8 @@ class FitSettings:
         initial_focal_std: standard deviation of the logarithm of that focal length.
         exif_focal_std: the same for a focal length from the metadata of the recording.
         principal_point_std_ratio: standard deviation of an unknown principal point about the image centre, over the
-            longer image side; 0 fixes it there. An image cropped by 96 of 540 px: joints 21.6 mm with 0, 13.9 mm with
-            0.05; uncropped 14.9 and 14.0 mm.
+            longer image side; 0 fixes it there. Images tell it to 8 % only: with 0.05 it strayed by 1 to 3 % on
+            uncropped turns, and took the focal length along (docs/decisions/body.md).
         landmark_steps: Levenberg-Marquardt steps of a fit to landmarks alone.
         silhouette_steps: the same between two matchings of the silhouettes.
         pose_rounds: matchings of the silhouettes in the fit of all poses. Three more: 16.2 -> 15.8 mm.
@@ -46,7 +46,7 @@ class FitSettings:
     initial_focal_ratio: float = 1.2
     initial_focal_std: float = 0.5
     exif_focal_std: float = 0.1
-    principal_point_std_ratio: float = 0.05
+    principal_point_std_ratio: float = 0.01
     landmark_steps: int = 12
     silhouette_steps: int = 3
     pose_rounds: int = 3
