@@ -112,8 +112,12 @@ def test_angles_scale_and_focal_length_of_a_turning_camera_are_found(ratio):
 
 
 def see_in_median(motion: np.ndarray, row: np.ndarray, ratio: float, points_px: np.ndarray) -> np.ndarray:
-    """Where the median camera sees what the camera of `row` sees at these points (motions are small: they add up)."""
-    return see(points_px, np.median(motion, axis=0) - row, ratio)
+    """Where the median camera sees what the camera of `row` sees at these points."""
+    focal, median = ratio * WIDTH, np.median(motion, axis=0)
+    rays = np.column_stack([(points_px - CENTRE) / (np.exp(row[3]) * focal), np.ones(len(points_px))])
+    scene = Rotation.from_euler("yxz", row[:3]).inv().apply(rays)
+    turned = Rotation.from_euler("yxz", median[:3]).apply(scene)
+    return np.exp(median[3]) * focal * turned[:, :2] / turned[:, 2:] + CENTRE
 
 
 def test_a_wall_without_corners_tells_nothing():

@@ -30,6 +30,7 @@ from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
 from pipeline.io.bvh import read_bvh
+from tests.body.acting import relative_to_line_of_sight
 from tests.body.smpl_sample import sample_arrays
 
 MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
@@ -239,7 +240,7 @@ def test_recorded_motions_stay_within_the_limits(limits: JointLimits, shared_dat
 OUT_OF_RANGE: Pose = {
     "LeftUpLeg": (95, 0, 0),
     "LeftArm": (-150, 0, 0),
-    "LeftShoulder": (0, 0, 100),
+    "LeftFoot": (90, 0, 0),
     "Head": (0, 140, 0),
     "LeftHand": (0, 110, 0),
 }
@@ -275,9 +276,9 @@ def fitted(objective: Objective, pose: Pose, with_limits: bool) -> torch.Tensor:
     skeleton = pose_skeleton(model, start.rotations, start.root_m)
     world = pose_points(model, skeleton, objective.regressor.points(model, start.landmark_offsets_m)).world_m
     pixels, _ = project(world, observations.camera)
-    observations = replace(
-        observations, landmarks_px=pixels, landmarks_3d_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25])
-    )
+    to_camera = torch.from_numpy(observations.camera.world_to_camera[:3, :3]).double()
+    landmarks_3d_m = relative_to_line_of_sight(world, observations.camera) @ to_camera
+    observations = replace(observations, landmarks_px=pixels, landmarks_3d_m=landmarks_3d_m)
     prior = objective.pose_prior
     if not with_limits:
         unlimited = torch.full_like(prior.limits.half_range_rad, 10.0)
