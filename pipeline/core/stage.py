@@ -157,7 +157,8 @@ def run_stage(plan: StagePlan, force: bool = False) -> bool:
 
 
 def discard_work_dir(plan: StagePlan) -> None:
-    """Remove unfinished work, if it exists."""
+    """Remove unfinished work, if it exists. UserError if no stage made the folder."""
+    _require_made(plan.work_dir)
     _remove_made(plan.work_dir)
 
 

@@ -13,7 +13,7 @@ from pipeline.core.config import Config
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST_FILE, read_manifest
 from pipeline.core.progress import warn
-from pipeline.core.stage import Stage, StagePlan, plan_stage, run_stage
+from pipeline.core.stage import Stage, StagePlan, discard_work_dir, plan_stage, run_stage
 
 Work = Callable[[Mapping[str, Path], Path, Any], Mapping[str, float]]
 
@@ -187,6 +187,16 @@ def test_what_no_stage_made_is_never_replaced(tmp_path: Path, name: str) -> None
     assert (own / "IMG_0001.png").read_text() == "mine"
     (own / "IMG_0001.png").unlink()
     assert run_stage(plan(tmp_path))
+
+
+def test_unfinished_work_is_removed_only_if_a_stage_made_it(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    own = tmp_path / "run" / "count.part"
+    own.mkdir()
+    (own / "IMG_0001.png").write_text("mine")
+    with pytest.raises(UserError, match="count.part was not made by this program"):
+        discard_work_dir(plan(tmp_path))
+    assert (own / "IMG_0001.png").read_text() == "mine"
 
 
 def test_files_of_the_user_in_a_result_outlive_it(tmp_path: Path) -> None:
