@@ -12,7 +12,7 @@ from data_tools.evaluate.field_truth import score_field
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.field_rows import FieldRow
 from pipeline.core.atomic import atomic_path
-from pipeline.core.manifest import digest_json, read_manifest
+from pipeline.core.manifest import digest_json, outputs_digests
 from pipeline.core.measure import describe_environment
 from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
@@ -55,9 +55,7 @@ class FieldTrial:
     @property
     def identity(self) -> str:
         """Digest of what the scores depend on, besides the code: options, frames and body."""
-        manifests = {name: read_manifest(self.run / name) for name in INPUTS}
-        inputs = {name: found.outputs_digest if found else None for name, found in manifests.items()}
-        config = self.config.model_dump(mode="json")
+        config, inputs = self.config.model_dump(mode="json"), outputs_digests(self.run, INPUTS)
         return digest_json({"config": config, "truth": self.truth is not None, "inputs": inputs})
 
 

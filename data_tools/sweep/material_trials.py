@@ -16,7 +16,7 @@ from data_tools.sweep.chart_trials import Trial
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import digest_json, digest_video, read_manifest
+from pipeline.core.manifest import digest_json, digest_video, outputs_digests
 from pipeline.core.measure import describe_environment
 from pipeline.mesh.files import load_dense_mesh, load_mesh
 from pipeline.texture.files import load_texture
@@ -54,8 +54,7 @@ class MaterialTrial:
         truth = self.base.capture / "truth"
         digests: dict[str, str | None] = {"truth": digest_video(truth) if truth.is_dir() else None}
         if not self.true_mesh:
-            manifests = {name: read_manifest(self.base.run_dir / name) for name in TEXTURE.needs}
-            digests |= {name: found.outputs_digest if found else None for name, found in manifests.items()}
+            digests |= outputs_digests(self.base.run_dir, TEXTURE.needs)
         return digest_json(digests)
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,12 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     except (ValueError, TypeError):
         raise UserError(f"{path} is damaged or from another version: delete {folder} and run the stage again") from None
+
+
+def outputs_digests(run_dir: Path, stages: Iterable[str]) -> dict[str, str | None]:
+    """Return `Manifest.outputs_digest` of each of these stages of a run; None for one that is not finished."""
+    manifests = {name: read_manifest(run_dir / name) for name in stages}
+    return {name: found.outputs_digest if found else None for name, found in manifests.items()}
 
 
 def fingerprint(stage: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str]) -> str:

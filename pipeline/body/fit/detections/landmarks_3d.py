@@ -99,7 +99,7 @@ def fit_3d_landmark_scale(
     x and y have the same factor; the depth has its own because the detector flattens people. The factors minimise the
     cost, so its derivative with respect to them is zero and the Jacobians may take them as constant.
 
-    relative_m, landmarks_3d_m: relative to the middle of the hips, camera axes.
+    relative_m, landmarks_3d_m: relative to the middle of the hips, axes of the line of sight.
     """
     weight, scale = inverse_std.square(), relative_m.new_ones(3)
     for _ in range(SCALE_ITERATIONS):
