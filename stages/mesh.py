@@ -14,8 +14,8 @@ from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture.capture import Capture, load_capture
-from pipeline.capture.frame_selection import VALIDATION, evenly_spaced
-from pipeline.capture.usable_frames import usable_positions
+from pipeline.capture.frame_selection import TRAIN, VALIDATION, evenly_spaced
+from pipeline.capture.usable_frames import usable_frames, usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
@@ -86,7 +86,7 @@ class Config(BaseConfig):
     max_person_px: int = Field(
         480, ge=64, le=4096, description="frames are downsampled until the person is at most this high, px"
     )
-    voxel_size_m: float = Field(0.005, gt=0.001, le=0.03, description="spacing of the density samples, m")
+    voxel_size_m: float = Field(0.005, gt=0.001, le=0.012, description="spacing of the density samples, m")
     edge_px: float = Field(3.0, gt=0.5, le=20.0, description="target edge length, in pixels of the downsampled frames")
     min_edge_m: float = Field(0.008, gt=0.001, description="lower limit of the target edge length, m")
     max_edge_m: float = Field(0.014, gt=0.001, description="upper limit of the target edge length, m")
@@ -284,9 +284,10 @@ def align_other_frames(
 ) -> tuple[Motion, dict[str, float]]:
     """Align the frames that are not trained on to the outlines of their masks through the mesh; never to colours.
 
-    Training frames keep their poses. Frames near them keep the interpolated corrections, with a warning, unless the
-    validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have no corrections;
-    they keep their poses unless the outlines of these frames fit better.
+    Training frames keep their poses, and so do frames without a usable fit: their masks may show someone else. Frames
+    near training frames keep the interpolated corrections, with a warning, unless the validation views prefer the new
+    poses (`MotionScores.is_better_than`). Frames far from them have no corrections; they keep their poses unless the
+    outlines of these frames fit better.
 
     validation: views of evenly spaced validation frames, from `load_views`.
 
@@ -294,15 +295,16 @@ def align_other_frames(
         The motion, and metrics.
     """
     (body, motion), (mesh, skin, shader) = posed_body, shaded_mesh
-    is_trained = np.zeros(len(capture), dtype=bool)
-    is_trained[usable_positions(capture, inputs["body"])] = True
-    views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_PERSON_PX)
+    usable = usable_frames(capture, inputs["body"])
+    is_trained = usable & (capture.split == TRAIN)
+    views = load_views(capture, np.flatnonzero(usable & ~is_trained), motion, inputs, body, MAX_PERSON_PX)
     surface = AlignedSurface.without_colours(torch.from_numpy(mesh.vertices), skin)
     fitted = load_motion(inputs["body"] / "motion.npz")
-    aligned = align_outlines(surface, body, (fitted, motion), is_trained, views)
+    motions = fitted.select(usable), motion.select(usable)
+    aligned = motion.with_poses_at(usable, align_outlines(surface, body, motions, is_trained[usable], views))
 
-    is_far = is_far_from(motion.time_s, motion.time_s[is_trained])
-    far_views = [view for view, far in zip(views, is_far[~is_trained], strict=True) if far]
+    is_far = is_far_from(motion.time_s, motion.time_s[is_trained]) & usable
+    far_views = [view for view, far in zip(views, is_far[usable & ~is_trained], strict=True) if far]
     moved = in_other_poses(far_views, canonical_to_world(body, aligned.select(np.flatnonzero(is_far))))
     use_far = silhouette_iou(mesh, skin, moved) > silhouette_iou(mesh, skin, far_views)
     positions = usable_positions(capture, inputs["body"], VALIDATION)
@@ -312,9 +314,10 @@ def align_other_frames(
         for poses in (motion, aligned)
     ]
     use_near = scores[1].is_better_than(scores[0])
-    if not use_near:
+    is_near = usable & ~is_trained & ~is_far
+    if validation and is_near.any() and not use_near:
         warn("frames next to training frames keep interpolated poses: validation frames prefer them")
-    use = ~is_trained & np.where(is_far, use_far, use_near)
+    use = (is_near & use_near) | (is_far & use_far)
     return merge_poses(use, aligned, motion), {
         **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
         **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
@@ -332,7 +335,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=41,
+    version=42,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

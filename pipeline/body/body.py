@@ -72,6 +72,12 @@ class Motion:
             self.frame_index[rows], self.time_s[rows], self.rotations_wxyz[rows], self.root_translation_m[rows]
         )
 
+    def with_poses_at(self, rows: np.ndarray, poses: Motion) -> Motion:
+        """Return the motion with other poses at selected rows (indices or mask)."""
+        rotations_wxyz, root_translation_m = self.rotations_wxyz.copy(), self.root_translation_m.copy()
+        rotations_wxyz[rows], root_translation_m[rows] = poses.rotations_wxyz, poses.root_translation_m
+        return self.with_pose(rotations_wxyz, root_translation_m)
+
     def with_pose(self, rotations_wxyz: np.ndarray, root_translation_m: np.ndarray) -> Motion:
         """Return the same frames with other poses."""
         return replace(

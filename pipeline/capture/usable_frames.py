@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import TRAIN
@@ -14,8 +14,8 @@ from pipeline.io.npz import load_npz
 SCORES_NPZ = "scores.npz"
 
 
-def usable_positions(capture: Capture, body_dir: Path, split: int = TRAIN) -> Int[np.ndarray, "k"]:
-    """Return the positions (0..n-1) of frames of one split with a usable fit: others neither train nor decide.
+def usable_frames(capture: Capture, body_dir: Path) -> Bool[np.ndarray, "n"]:
+    """Return which frames have a usable fit: the masks of the others may show someone or something else.
 
     Raises:
         UserError: the folder of the body stage does not hold this information.
@@ -27,4 +27,13 @@ def usable_positions(capture: Capture, body_dir: Path, split: int = TRAIN) -> In
             f"{path} does not say which of the {len(capture)} frames are usable (written by an older version); "
             f"run {rerun_command('body', body_dir)}"
         )
-    return np.flatnonzero((capture.split == split) & usable)
+    return usable
+
+
+def usable_positions(capture: Capture, body_dir: Path, split: int = TRAIN) -> Int[np.ndarray, "k"]:
+    """Return the positions (0..n-1) of frames of one split with a usable fit: others neither train nor decide.
+
+    Raises:
+        UserError: as `usable_frames`.
+    """
+    return np.flatnonzero((capture.split == split) & usable_frames(capture, body_dir))

@@ -44,6 +44,4 @@ def align_outlines(
     learnt = corrections_between(body, fitted.select(known), corrected.select(known))
     prior = prior_given_others(corrected.time_s.astype(np.float64), is_known, PRIOR_WIDTH * learnt)
     aligned = align_motion(surface, body, corrected.select(free), views, prior, ITERATIONS)
-    rotations_wxyz, root_m = corrected.rotations_wxyz.copy(), corrected.root_translation_m.copy()
-    rotations_wxyz[free], root_m[free] = aligned.rotations_wxyz, aligned.root_translation_m
-    return corrected.with_pose(rotations_wxyz, root_m)
+    return corrected.with_poses_at(free, aligned)

@@ -324,7 +324,7 @@ def normal_equations(
     torques = (moments.transpose(1, 0, 2) @ by_joint).reshape(2, len(points_m), len(joints), 3)
     torques *= evidence.subtree_weights[:, :, None]
     along_x, along_y = np.concatenate(
-        [torques.reshape(2, len(points_m), -1), pixel_by_point.transpose(1, 0, 2)], axis=2
+        [torques.reshape(2, len(points_m), 3 * len(joints)), pixel_by_point.transpose(1, 0, 2)], axis=2
     )
     xx, xy, yy = (evidence.structure[:, i, k, None] for i, k in ((0, 0), (0, 1), (1, 1)))
     matrix = along_x.T @ (xx * along_x + xy * along_y) + along_y.T @ (xy * along_x + yy * along_y)

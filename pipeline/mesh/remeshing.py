@@ -90,7 +90,11 @@ def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
     """Return the mesh faces at the face of the person, without hair; none if the body has no head joint."""
     centres_m = mesh.vertices[mesh.faces].mean(axis=1)
-    return face_weight(centres_m, signed_distance_m(centres_m, body.mesh()), body) > 0.5
+    found = face_weight(centres_m, np.zeros(len(centres_m)), body) > 0.5  # weights fall with the distance
+    if found.any():
+        distance_m = signed_distance_m(centres_m[found], body.mesh())
+        found[found] = face_weight(centres_m[found], distance_m, body) > 0.5
+    return found
 
 
 def decimate(mesh: Mesh, face_count: int) -> Mesh:

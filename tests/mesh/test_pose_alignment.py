@@ -130,10 +130,13 @@ def test_subtrees_hold_a_joint_and_all_below_it() -> None:
     np.testing.assert_array_equal(descendant_matrix(parents.tolist())[[0, 1]].T, expected)
 
 
+@pytest.mark.parametrize("beside_m", [0.0, 5.0])
 def test_a_view_without_the_person_keeps_its_neighbours_correction(
-    body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion
+    body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion, beside_m: float
 ) -> None:
+    """The mask is empty; or the view is a crop of someone else, beside which the mesh is drawn."""
     empty = replace(views[3], image=torch.zeros_like(views[3].image), mask=torch.zeros_like(views[3].mask))
+    empty = replace(empty, camera=replace(empty.camera, cx=empty.camera.cx + beside_m * empty.camera.fx))
     wrong, _, _ = disturbed(true_motion)
     offsets = aligned(body, skin, [*views[:3], empty, *views[4:]], wrong)
     assert torch.isfinite(offsets.rotation_rad).all()

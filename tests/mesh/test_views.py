@@ -1,5 +1,6 @@
 """Views of a known mesh: crops and their cameras, renders of the true mesh, and where the image error is."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -29,6 +30,7 @@ def test_renders_of_the_true_mesh_match_its_views(egg: Mesh, egg_body: Body, egg
     skin = transfer_skin(egg, egg_body)
     assert mesh_psnr_db(egg, skin, egg_views[1], PATTERN) > 45  # the error of rounding to 8 bits
     assert silhouette_iou(egg, skin, egg_views[1]) > 0.98
+    assert math.isnan(silhouette_iou(egg, skin, []))
     assert accumulate_face_errors(egg, skin, egg_views[0], PATTERN).max() < 0.5
 
 

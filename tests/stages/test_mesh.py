@@ -36,7 +36,7 @@ from stages.mesh import Config, run
 SIZE_PX, FRAMES = 96, 12
 CAMERA = Camera(190.0, 190.0, SIZE_PX / 2, SIZE_PX / 2, SIZE_PX, SIZE_PX)
 CONFIG = Config(
-    voxel_size_m=0.02,
+    voxel_size_m=0.012,
     rounds=2,
     steps=6,
     min_edge_m=0.03,
@@ -272,6 +272,33 @@ def test_frames_far_from_training_frames_follow_their_own_outline(
     run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
     off_m = load_motion(tmp_path / "motion.npz").root_translation_m - truth.root_translation_m
     np.testing.assert_allclose(off_m[:, 0], np.where(np.arange(FRAMES) >= 9, kept_m, 0.0), atol=1e-6)
+
+
+def test_frames_without_a_usable_fit_keep_their_poses(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames 8 (held out) and 3 (training) show someone else; the alignment brings the others to the truth."""
+    usable = ~np.isin(np.arange(FRAMES), (3, 8))
+    save_npz(inputs["body"] / SCORES_NPZ, {"usable": usable})
+    path = inputs["field"] / "motion.npz"
+    truth = load_motion(path)
+    save_motion(path, shifted(truth, (0, 3, 4, 8), 0.05))
+    rows = np.flatnonzero(np.isin(np.flatnonzero(usable), (0, 4)))
+    monkeypatch.setattr(mesh_stage, "align_outlines", align_to(lambda motion: shifted(motion, rows, -0.05)))
+    metrics = run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
+    off_m = load_motion(tmp_path / "motion.npz").root_translation_m - truth.root_translation_m
+    np.testing.assert_allclose(off_m[:, 0], np.where(usable, 0.0, 0.05), atol=1e-6)
+    assert metrics["aligned_frames"] == 2.0
+
+
+def test_without_validation_frames_nothing_is_said_in_their_name(inputs: dict[str, Path], tmp_path: Path) -> None:
+    arrays = load_npz(inputs["frames"] / "frames.npz")
+    split = np.where(arrays["split"] == 1, 2, arrays["split"])
+    np.savez(inputs["frames"] / "frames.npz", **(arrays | {"split": split}))
+    take_warnings()
+    metrics = run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
+    assert np.isnan(metrics["silhouette_iou"])
+    assert not [warning for warning in take_warnings() if "validation frames prefer" in warning]
 
 
 def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -> None:
