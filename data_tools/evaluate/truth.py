@@ -16,11 +16,13 @@ from jaxtyping import UInt8
 
 from data_tools.command import run_command
 from data_tools.folder import atomic_folder
+from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.rig.subject import load_subject
 from data_tools.synthetic.scene.backdrop import Room, floor_points
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import CAPTURE_VERSION, SyntheticCapture
 from data_tools.synthetic.scene.renderer import Light, pose_vertices
+from data_tools.synthetic.scene.walk_around import make_surroundings
 from pipeline.avatar.obj import ObjMaps, write_obj
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
@@ -77,6 +79,9 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         fps=fps,
         samples=samples,
         ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
+        surroundings=make_surroundings(camera, ground_m, settings["background"] == "busy", ValueNoise(settings["seed"]))
+        if settings.get("walk_around")
+        else None,
     )
 
 

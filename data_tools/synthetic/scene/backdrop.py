@@ -102,12 +102,12 @@ def _room_colours(
     noise: ValueNoise,
 ) -> Float[np.ndarray, "n 3"]:
     on_floor = ~np.isnan(floor_m[:, 0])
-    colours = _wall_colours(wall_m - ground_m, is_furnished, noise)
-    colours[on_floor] = _floor_colours(floor_m[on_floor] - ground_m, noise)
+    colours = wall_colours(wall_m - ground_m, is_furnished, noise)
+    colours[on_floor] = floor_colours(floor_m[on_floor] - ground_m, noise)
     return np.clip(colours, 0.0, 1.0)
 
 
-def _wall_colours(
+def wall_colours(
     position_m: Float[np.ndarray, "n 3"], is_furnished: bool, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Colour plaster with a soft highlight, a skirting board and furniture; position_m is relative to `ground_m`."""
@@ -124,7 +124,7 @@ def _wall_colours(
     return colours
 
 
-def _floor_colours(position_m: Float[np.ndarray, "n 3"], noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
+def floor_colours(position_m: Float[np.ndarray, "n 3"], noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
     """Colour floor boards along Z, each with its own tone and dark gaps; position_m is relative to `ground_m`."""
     board = np.floor(position_m[:, 0] / 0.14)
     tone = 0.07 * np.sin(12.9898 * board) + noise(position_m.astype(np.float32), (0.012, 1.0, 0.30)) * 0.06

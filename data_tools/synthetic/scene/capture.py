@@ -22,6 +22,7 @@ from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.hand_held import hand_held_angles_rad, turn_picture
 from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
+from data_tools.synthetic.scene.walk_around import Surroundings, turned_light, walking_shift_m
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.core.progress import track
@@ -43,7 +44,9 @@ class SyntheticCapture:
         ground_m: point on the floor where the person stands (world).
         samples: antialiasing samples per pixel and axis.
         hand_held_rad: by how much the camera turns while it films. The ground truth, masks included, is that of a
-            camera that stands still.
+            camera that does not turn.
+        surroundings: the room if the camera is carried around the person (`motion` has the shifts of its walk): `room`
+            is then that of the first frame. None: the camera stays in its place.
     """
 
     subject: Subject
@@ -56,22 +59,39 @@ class SyntheticCapture:
     samples: int
     ball: Ball | None = None
     hand_held_rad: float = 0.0
+    surroundings: Surroundings | None = None
 
     @cached_property
     def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
         """Skinning matrices of all frames."""
         return canonical_to_world(self.subject.body, self.motion)
 
+    def turn_rad(self, frame_index: int) -> float:
+        """Return the angle about the vertical by which the root joint has turned since the first frame."""
+        first, now = (self.canonical_to_world[row, 0, [0, 2], 2].numpy() for row in (0, frame_index))
+        return float(np.arctan2(*now) - np.arctan2(*first))
+
+    def room_of_frame(self, frame_index: int) -> Room:
+        """Return the empty room of a frame."""
+        if self.surroundings is None:
+            return self.room
+        shift_m = walking_shift_m(self.motion.time_s[frame_index : frame_index + 1])[0]
+        return self.surroundings.seen_by(self.camera, self.ground_m + shift_m, self.turn_rad(frame_index))
+
+    def light_of_frame(self, frame_index: int) -> Light:
+        """Return the light of a frame in the world of the camera."""
+        return self.light if self.surroundings is None else turned_light(self.light, self.turn_rad(frame_index))
+
     def render_person(self, frame_index: int) -> Float[np.ndarray, "h w 4"]:
         """Render the person without the room: premultiplied sRGB and coverage, in [0, 1]."""
         vertices = pose_vertices(self.subject, self.canonical_to_world[frame_index])
-        return render_subject(self.subject, vertices, self.camera, self.light, self.samples)
+        return render_subject(self.subject, vertices, self.camera, self.light_of_frame(frame_index), self.samples)
 
     def render_frame(self, frame_index: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
         """Render the camera image and the coverage by the person, both in 0 to 255."""
         person = self.render_person(frame_index)
-        shadow = contact_shadow(self.room, self._feet_m(frame_index))
-        background = self.room.image * shadow[:, :, None]
+        room = self.room_of_frame(frame_index)
+        background = room.image * contact_shadow(room, self._feet_m(frame_index))[:, :, None]
         image, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * background, person[:, :, 3]
         if self.ball:
             ball = self.ball.render_rgba(self.camera, frame_index / self.fps, self.light, self.samples)

@@ -13,6 +13,7 @@ from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.motion import add_joint_angles, bend_at_hips, novel_motion, posture, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
+from data_tools.synthetic.scene.walk_around import make_surroundings, walking_shift_m
 from pipeline.avatar.motion.retarget import resample_motion, retarget
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
@@ -54,6 +55,9 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         type=float,
         default=0.0,
         help="angle by which a camera in the hand turns to both sides, degrees",
+    )
+    parser.add_argument(
+        "--walk-around", action="store_true", help="the person stands still and the camera is carried around"
     )
     parser.add_argument(
         "--lean-deg",
@@ -134,6 +138,8 @@ def validate_capture_options(options: argparse.Namespace) -> None:
             raise UserError(f"--{name.replace('_', '-')} {value} is out of range; choose a value from {low} to {high}")
     if options.turns is not None and (options.bvh or options.arc < 360.0):
         raise UserError("--turns is for the full turn in A-pose; remove it, or --bvh and --arc")
+    if options.walk_around and (options.bvh or options.arc < 360.0 or options.ball):
+        raise UserError("--walk-around is for a person who stands still; remove it, or --bvh, --arc and --ball")
     if options.size % 2:
         raise UserError(f"--size {options.size} is odd; H.264 needs an even size: choose {options.size + 1}")
 
@@ -175,6 +181,9 @@ def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) 
     else:
         turns = options.turns or 1
         motion = turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc, turns)
+        if options.walk_around:
+            shifted_m = motion.root_translation_m + walking_shift_m(motion.time_s)
+            motion = motion.with_pose(motion.rotations_wxyz, shifted_m)
     if options.lower_arms_deg or options.close_legs_deg or options.hand_on_hip:
         angles = posture(options.lower_arms_deg, options.close_legs_deg, options.hand_on_hip)
         motion = add_joint_angles(body, motion, angles)
@@ -212,6 +221,9 @@ def build_capture(
         options.samples,
         ball,
         float(np.radians(options.hand_held_deg)),
+        make_surroundings(camera, ground_m, options.background == "busy", ValueNoise(options.seed))
+        if options.walk_around
+        else None,
     )
     # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
