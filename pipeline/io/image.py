@@ -243,7 +243,7 @@ def _decode(path: Path) -> _Decoded:
     if not path.is_file():
         raise UserError(f"image {path} does not exist; check the contents of the folder")
     try:
-        pixels, orientation, profile, format_name = _read_file(path)
+        pixels, orientation, profile, format_name, is_premultiplied = _read_file(path)
     except (ValueError, RuntimeError) as error:  # C++ exceptions, for damaged headers
         raise _unreadable(path, str(error)) from None
     is_exr = format_name == "openexr"
@@ -255,11 +255,16 @@ def _decode(path: Path) -> _Decoded:
     colour, alpha = (pixels[..., :-1], pixels[..., -1]) if has_alpha else (pixels, None)
     if is_exr:
         colour, alpha = _srgb_of_exr(colour, alpha, path)
+    elif is_premultiplied and alpha is not None:
+        colour = _divide_by_alpha(colour, alpha)
     return _Decoded(colour, alpha, orientation, profile)
 
 
-def _read_file(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], int, bytes, str]:
-    """Return pixels, EXIF orientation, ICC profile (empty if there is none) and OpenImageIO's name of the format."""
+def _read_file(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], int, bytes, str, bool]:
+    """Return pixels, EXIF orientation, ICC profile (empty if there is none) and OpenImageIO's name of the format.
+
+    The last value is whether it is a TIFF whose integer colours are premultiplied by its alpha, as the file says.
+    """
     keep_alpha_straight = oiio.ImageSpec()
     keep_alpha_straight.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), keep_alpha_straight)
@@ -272,6 +277,8 @@ def _read_file(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], int, bytes, str
     if format_name == "webp":
         tag = read_exif_tag(path, ExifTags.Base.Orientation)
         orientation = tag if isinstance(tag, int) else 1
+    is_straight = spec.get_int_attribute("oiio:UnassociatedAlpha") or spec.alpha_channel < 0
+    is_premultiplied = format_name == "tiff" and not is_straight
     primaries = spec.getattribute("chromaticities")
     if primaries is not None and not np.allclose(primaries[:6], _BT_709_PRIMARIES, atol=1e-3):
         raise UserError(f"image {path} has other primaries than sRGB; convert it to linear sRGB")
@@ -280,7 +287,7 @@ def _read_file(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], int, bytes, str
     file.close()
     if pixels is None or (message and _HARMLESS_WARNING not in message):
         raise _unreadable(path, message)
-    return pixels, orientation, b"" if profile is None else bytes(profile), format_name
+    return pixels, orientation, b"" if profile is None else bytes(profile), format_name, is_premultiplied
 
 
 def _unreadable(path: Path, message: str) -> UserError:
@@ -299,6 +306,15 @@ def _srgb_of_exr(
         alpha = alpha.astype(np.float32)
         light = light / np.where(alpha > 0, alpha, 1.0)[..., None]
     return linear_to_srgb(np.maximum(light, 0.0)).astype(np.float32), alpha
+
+
+def _divide_by_alpha(
+    colour: Shaped[np.ndarray, "h w c"], alpha: Shaped[np.ndarray, "h w"]
+) -> Shaped[np.ndarray, "h w c"]:
+    """Return the straight colours of premultiplied integer ones; they stay where alpha is 0."""
+    white = np.iinfo(colour.dtype).max
+    share = np.where(alpha > 0, alpha, white).astype(np.float32) / np.float32(white)
+    return np.minimum(np.rint(colour / share[..., None]), white).astype(colour.dtype)
 
 
 def _upright(pixels: Shaped[np.ndarray, "..."], orientation: int) -> Shaped[np.ndarray, "..."]:

@@ -150,16 +150,6 @@ def test_exr_of_other_primaries_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
-def test_colours_below_transparent_pixels_are_kept(tmp_path, suffix):
-    rgba = np.full((4, 4, 4), (200, 100, 50, 0), np.uint8)
-    rgba[0] = (10, 20, 30, 128)
-    Image.fromarray(rgba).save(tmp_path / f"a{suffix}", lossless=True, exact=True)
-    np.testing.assert_array_equal(image.read_rgba(tmp_path / f"a{suffix}"), rgba)
-    np.testing.assert_array_equal(image.read_rgb(tmp_path / f"a{suffix}"), rgba[..., :3])
-    np.testing.assert_array_equal(image.read_alpha(tmp_path / f"a{suffix}"), rgba[..., 3])
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_every_exif_orientation_is_applied(tmp_path, pixels, suffix, orientation):
     exif = Image.Exif()
