@@ -66,6 +66,19 @@ def read_manifest(folder: Path) -> Manifest | None:
         raise UserError(f"{path} is damaged or from another version: delete {folder} and run the stage again") from None
 
 
+def finished_stages(run_dir: Path) -> dict[str, Manifest]:
+    """Return the manifests of a run's finished stages by name: of the folders whose manifest names them as a stage.
+
+    Other folders may hold a manifest of another format, as that of a comparison with the ground truth does.
+
+    Raises:
+        UserError: a manifest is damaged.
+    """
+    names = sorted(path.name for path in run_dir.iterdir() if _holds_stage(path)) if run_dir.is_dir() else []
+    manifests = {name: read_manifest(run_dir / name) for name in names}
+    return {name: manifest for name, manifest in manifests.items() if manifest}
+
+
 def outputs_digests(run_dir: Path, stages: Iterable[str]) -> dict[str, str | None]:
     """Return `Manifest.outputs_digest` of each of these stages of a run; None for one that is not finished."""
     manifests = {name: read_manifest(run_dir / name) for name in stages}
@@ -109,6 +122,16 @@ def digest_files(folder: Path) -> dict[str, str]:
 def list_files(folder: Path) -> list[str]:
     """Return the relative POSIX paths of all files under `folder`, also in linked folders, sorted."""
     return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, frozenset()))
+
+
+def _holds_stage(folder: Path) -> bool:
+    """Return whether the manifest in a folder is that of the stage of this name, or is damaged."""
+    path = folder / MANIFEST_FILE
+    try:
+        document = load_json(path) if path.is_file() else None
+    except ValueError:
+        return True
+    return isinstance(document, dict) and document.get("stage") == folder.name
 
 
 def _walk(folder: Path, above: frozenset[Path]) -> Iterator[Path]:

@@ -12,7 +12,7 @@ from pipeline.core.command import format_command
 from pipeline.core.config import FILE_OPTION_SUFFIX, PRESET_SUFFIXES
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
-from pipeline.core.manifest import digest_video, read_manifest
+from pipeline.core.manifest import digest_video, finished_stages
 
 RUN_FILE = "run.json"
 
@@ -107,5 +107,5 @@ def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video:
 
 def _digests_of_video(run_dir: Path) -> set[str]:
     """Return the digests of the videos that the finished stages of a run have read: of one that moved since, too."""
-    manifests = [read_manifest(folder) for folder in run_dir.iterdir()] if run_dir.is_dir() else []
-    return {manifest.inputs["video"] for manifest in manifests if manifest and "video" in manifest.inputs}
+    inputs = [manifest.inputs for manifest in finished_stages(run_dir).values()]
+    return {digests["video"] for digests in inputs if "video" in digests}
