@@ -30,7 +30,7 @@ from pipeline.capture.capture import load_capture
 from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
-from pipeline.core.manifest import read_manifest
+from pipeline.core.manifest import read_manifest, require_matching_stages
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning, local_quaternions
 from pipeline.io.bvh import read_bvh, require_bvh_file, write_bvh
@@ -120,13 +120,17 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
 def export_config(run: Path) -> export.Config:
     """Return the options of the finished export stage of a run, without its further formats.
 
-    These need optional packages, and nothing that reads a finished export writes them. UserError if it is not finished.
+    These need optional packages, and nothing that reads a finished export writes them.
+
+    Raises:
+        UserError: it is not finished, or does not belong to the stages that it has read, as after a new mesh alone.
     """
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; name the folder of a finished run")
     manifest = read_manifest(run / "export")
     if manifest is None:
         raise UserError(f"{run} has no finished export; run {format_command('--run', run)}")
+    require_matching_stages(run, (*export.STAGE.needs, export.STAGE.name))
     names = export.Config.model_fields.keys() - {"formats"}
     known = {name: value for name, value in manifest.config.items() if name in names}
     return export.Config(**known)

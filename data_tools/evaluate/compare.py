@@ -17,7 +17,15 @@ from data_tools.evaluate.page import write_comparison
 from data_tools.evaluate.truth import read_capture_settings, require_current_version
 from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST_FILE, digest_file, digest_json, digest_video, read_manifest
+from pipeline.core.manifest import (
+    MANIFEST_FILE,
+    digest_file,
+    digest_json,
+    digest_video,
+    read_manifest,
+    require_matching_stages,
+)
+from stages import STAGES
 
 
 def main(argv: Sequence[str]) -> None:
@@ -34,6 +42,7 @@ def main(argv: Sequence[str]) -> None:
         command = format_command("--run", options.run, "--video", options.out / "video")
         raise UserError(f"{options.run} has no finished stage; run {command}")
     _require_video_of(options.out, options.run)
+    require_matching_stages(options.run, STAGES if "report" in finished else finished)
     sections: dict[str, Any] = {}
     if "frames" in finished:
         sections["masks"] = compare_masks(options.out, options.run / "frames")

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 
@@ -83,6 +84,25 @@ def outputs_digests(run_dir: Path, stages: Iterable[str]) -> dict[str, str | Non
     """Return `Manifest.outputs_digest` of each of these stages of a run; None for one that is not finished."""
     manifests = {name: read_manifest(run_dir / name) for name in stages}
     return {name: found.outputs_digest if found else None for name, found in manifests.items()}
+
+
+def require_matching_stages(run_dir: Path, stages: Iterable[str]) -> None:
+    """Check that the finished ones of these stages belong together; others are left out.
+
+    Fingerprints do not count, as options and files may have changed since: what a stage has read does.
+
+    Raises:
+        UserError: one was made from another result of one of the others than the run holds now.
+    """
+    found = {name: read_manifest(run_dir / name) for name in stages}
+    manifests = {name: manifest for name, manifest in found.items() if manifest}
+    for name, manifest in manifests.items():
+        for need, digest in manifest.inputs.items():
+            if need in manifests and manifests[need].outputs_digest != digest:
+                raise UserError(
+                    f"{run_dir / name} was made from another result of {need} than {run_dir / need} holds now; "
+                    f"make the stages that follow anew: {format_command('--run', run_dir)}"
+                )
 
 
 def fingerprint(stage: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str]) -> str:

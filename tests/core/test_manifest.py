@@ -20,6 +20,7 @@ from pipeline.core.manifest import (
     fingerprint,
     list_files,
     read_manifest,
+    require_matching_stages,
     write_manifest,
 )
 
@@ -129,3 +130,24 @@ def test_a_manifest_is_strict_json(tmp_path: Path) -> None:
     finished(tmp_path / "mesh")
     values = json.loads((tmp_path / "mesh" / MANIFEST_FILE).read_text())
     assert {"stage", "version", "fingerprint", "config", "inputs", "outputs", "metrics", "seconds"} <= values.keys()
+
+
+def write_stage(run: Path, name: str, content: bytes, **inputs: str) -> Manifest:
+    """Write a finished stage with one file; inputs: digest by name."""
+    (run / name).mkdir(parents=True, exist_ok=True)
+    (run / name / "result").write_bytes(content)
+    manifest = Manifest(name, 1, "", {}, inputs, digest_files(run / name), {}, 1.0, 2.0)
+    write_manifest(manifest, run / name / MANIFEST_FILE)
+    return manifest
+
+
+def test_stages_that_do_not_belong_together_are_named(tmp_path: Path) -> None:
+    """The fingerprint does not count: only what the later stage has read, and what is there now."""
+    mesh = write_stage(tmp_path, "mesh", b"vertices", video="0a", model_file="0b")
+    write_stage(tmp_path, "texture", b"pixels", mesh=mesh.outputs_digest, frames="not finished")
+    require_matching_stages(tmp_path, ["frames", "mesh", "texture"])
+    write_stage(tmp_path, "mesh", b"other vertices")
+    with pytest.raises(UserError, match=r"another result of mesh than .*/mesh holds now; .* --run "):
+        require_matching_stages(tmp_path, ["frames", "mesh", "texture"])
+    require_matching_stages(tmp_path, ["frames", "mesh"])
+    require_matching_stages(tmp_path, ["frames", "texture"])

@@ -16,7 +16,7 @@ from pipeline.avatar.motion.feet import joint_positions_m, lowest_foot_offset_m
 from pipeline.avatar.skinned_avatar import lowest_vertex_y_m
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import digest_files
+from pipeline.core.manifest import MANIFEST_FILE, Manifest, digest_files, write_manifest
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.bvh import read_bvh
@@ -39,6 +39,19 @@ def test_a_run_with_formats_of_a_missing_package_is_read(run: Path, monkeypatch:
     config = export_config(run)
     assert config.formats == ()
     assert config.rig == "mixamo"
+
+
+def test_a_run_whose_stages_do_not_belong_together_is_refused(run: Path) -> None:
+    """As after a mesh stage alone, or a command stopped after it: the texture has the faces of the old mesh."""
+    stages = {name: Manifest(name, 1, "", {}, {}, {"result": "0a"}, {}, 0.0, 0.0) for name in ("mesh", "texture")}
+    made_from = {"mesh": stages["mesh"].outputs_digest}
+    stages["texture"] = replace(stages["texture"], inputs=made_from)
+    for name, manifest in stages.items():
+        write_manifest(manifest, run / name / MANIFEST_FILE)
+    assert export_config(run).rig == "mixamo"
+    write_manifest(replace(stages["mesh"], outputs={"result": "0b"}), run / "mesh" / MANIFEST_FILE)
+    with pytest.raises(UserError, match="texture was made from another result of mesh than .* --run "):
+        export_config(run)
 
 
 @pytest.fixture

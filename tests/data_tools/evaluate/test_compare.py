@@ -166,9 +166,9 @@ def test_run_of_another_capture_is_an_error(sample: Path, run: Path) -> None:
         compare_body(sample, run / "body")
 
 
-def write_manifest_of(video: Path, frames: Path) -> None:
-    inputs = {"video": digest_video(video)}
-    write_manifest(Manifest("frames", 1, "", {}, inputs, {}, {}, 1.0, 1.0), frames / MANIFEST_FILE)
+def write_manifest_of(video: Path, stage: Path, **inputs: str) -> None:
+    inputs |= {"video": digest_video(video)}
+    write_manifest(Manifest(stage.name, 1, "", {}, inputs, {}, {}, 1.0, 1.0), stage / MANIFEST_FILE)
 
 
 def test_a_run_of_another_video_is_refused(
@@ -214,7 +214,7 @@ def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsy
     assert run_command(compare_command, [str(sample), str(run)]) == 2
     assert "has no finished stage" in capsys.readouterr().err
     write_manifest_of(sample / "video", run / "frames")
-    (run / "body" / "manifest.json").write_text("{}")
+    write_manifest_of(sample / "video", run / "body")
     assert run_command(compare_command, [str(sample), str(run)]) == 0
     printed = capsys.readouterr().out
     assert "mask_iou_median" in printed
@@ -231,7 +231,21 @@ def test_command_says_where_the_light_is_not_flat(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (run / "report").mkdir()
-    (run / "report" / "manifest.json").write_text("{}")
+    write_manifest_of(sample / "video", run / "report")
     monkeypatch.setattr(compare, "write_comparison", lambda out, run_dir, measured: {"light": light})
     assert run_command(compare_command, [str(sample), str(run)]) == 0
     assert ("--light flat" in capsys.readouterr().out) == is_said
+
+
+def test_a_run_whose_stages_do_not_belong_together_is_refused(
+    sample: Path, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frames were selected anew: what the report calls held out is not what the frames do now."""
+    (run / "report").mkdir()
+    write_manifest_of(sample / "video", run / "frames")
+    write_manifest_of(sample / "video", run / "report", frames="digest of other frames")
+    monkeypatch.setattr(compare, "write_comparison", lambda out, run_dir, measured: {})
+    assert run_command(compare_command, [str(sample), str(run)]) == 2
+    assert f"{run / 'report'} was made from another result of frames than" in capsys.readouterr().err
+    (run / "report" / MANIFEST_FILE).unlink()
+    assert run_command(compare_command, [str(sample), str(run)]) == 0
