@@ -141,7 +141,7 @@ def run(
         images=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
         levels=[read_level(path) for path in sorted(inputs["export"].glob("avatar_lod*.glb"))],
-        coverage=read_gray(inputs["texture"] / COVERAGE),
+        coverage=exported.coverage_map(loaded.avatar, read_gray(inputs["texture"] / COVERAGE)),
     )
     (out / "index.html").write_text(render_page(page), encoding="utf-8")
     (out / "report.json").write_text(report_to_json(report), encoding="utf-8")
@@ -361,7 +361,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=15,
+    version=16,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,
