@@ -30,10 +30,11 @@ from data_tools.sweep.runs import (
 from data_tools.templates import render_template
 from pipeline.capture.video import VIDEO_SUFFIXES
 from pipeline.core.atomic import atomic_path
+from pipeline.core.config import parse_overrides
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import list_files
 from pipeline.core.progress import track
-from pipeline.core.run_folder import default_run_dir
+from pipeline.core.run_folder import RunRequest, default_run_dir
 from pipeline.core.status import FRESH
 
 
@@ -47,7 +48,7 @@ def main(argv: Sequence[str]) -> None:
     videos = find_videos(options.videos)
     if not options.table:
         _run_videos(videos, options)
-    rows = {name: table_row(name, read_run(options.runs / name)) for name in track(videos, "table")}
+    rows = {name: table_row(name, _read_run(name, videos, options)) for name in track(videos, "table")}
     write_table(options.runs, rows.values())
     print(text_table(rows.values()))
     failed = [name for name, row in rows.items() if row["status"] != "done"]
@@ -135,7 +136,7 @@ def _run_videos(videos: Mapping[str, Path], options: argparse.Namespace) -> None
         run_dir = options.runs / name
         tqdm.write(f"{name}: started, log in {log_path(run_dir)}", file=sys.stderr)
         start_run(run_dir, ["--video", str(videos[name]), *arguments], threads)
-        return f"{name}: {read_run(run_dir).status}"
+        return f"{name}: {_read_run(name, videos, options).status}"
 
     with ThreadPoolExecutor(options.jobs) as pool:
         futures = [pool.submit(run_one_video, name) for name in videos]
@@ -144,6 +145,12 @@ def _run_videos(videos: Mapping[str, Path], options: argparse.Namespace) -> None
                 tqdm.write(future.result(), file=sys.stderr)
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _read_run(name: str, videos: Mapping[str, Path], options: argparse.Namespace) -> RunState:
+    """Read the run of a video; only results of this video with the options of the command count."""
+    run_dir, overrides = options.runs / name, parse_overrides(options.set)
+    return read_run(run_dir, request=RunRequest(run_dir, videos[name], options.preset, overrides))
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

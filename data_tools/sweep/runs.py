@@ -19,6 +19,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.parent import die_with_parent_environment
 from pipeline.core.record import RunRecord, read_record
+from pipeline.core.run_folder import RunRequest
 from pipeline.core.status import FRESH, stage_states
 
 ERROR_PREFIX = "error: "
@@ -66,18 +67,20 @@ class RunState:
         return sum((self.manifests[name].seconds for name in names if name in self.manifests), 0.0)
 
 
-def read_run(run_dir: Path, record: RunRecord | None = None) -> RunState:
+def read_run(run_dir: Path, record: RunRecord | None = None, request: RunRequest | None = None) -> RunState:
     """Read the state of a run; a run without a folder has only missing stages.
 
-    A damaged record or an unknown option is returned as the failure of this run, so that other runs can be read.
+    A damaged record, an unknown option, another video or a file that cannot be opened is returned as the failure of
+    this run, so that other runs can be read.
 
     Args:
         record: expected video and options, with which stages must agree to be fresh; default: that of the folder.
+        request: a command that changes the record: stages must agree with what it asks for, even if it was refused.
     """
     failure = last_error_message(log_path(run_dir))
     try:
-        states = _states(run_dir, record)
-    except UserError as error:
+        states = _states(run_dir, record, request)
+    except (UserError, OSError) as error:
         states, failure = dict.fromkeys(stages.STAGES, "missing"), str(error)
     found = {name: read_manifest(run_dir / name) for name, state in states.items() if state == FRESH}
     manifests = {name: manifest for name, manifest in found.items() if manifest}
@@ -164,8 +167,9 @@ def cpu_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _states(run_dir: Path, record: RunRecord | None) -> dict[str, str]:
-    return stage_states(stages.PIPELINE, run_dir, record or read_record(run_dir))
+def _states(run_dir: Path, record: RunRecord | None, request: RunRequest | None) -> dict[str, str]:
+    record = record or read_record(run_dir)
+    return stage_states(stages.PIPELINE, run_dir, request.apply(record) if request else record)
 
 
 def _read_json(path: Path) -> Any:

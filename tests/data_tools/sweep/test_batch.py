@@ -70,6 +70,24 @@ def test_only_a_repaired_video_runs_again(batch: Toy) -> None:
 
 
 @pytest.mark.slow
+def test_results_of_another_video_or_with_other_options_do_not_count(batch: Toy) -> None:
+    """A command that is refused leaves the earlier results, which are complete."""
+    (batch.folder / "videos" / "bob.mp4").write_text("1 2")
+    assert batch.call("data_tools.sweep.batch", "videos").returncode == 0
+    batch.expect_user_error("data_tools.sweep.batch", "videos", "--table", "--set", "learn.steps=30")
+    assert [rows(batch)["ann"][name] for name in TOY_STAGES] == ["fresh", "stale", "waits for learn"]
+    assert batch.call("data_tools.sweep.batch", "videos", "--table").returncode == 0
+    other = batch.folder / "other"
+    other.mkdir()
+    (other / "ann.mp4").write_text("6 7 8")
+    for arguments in ((), ("--table",)):
+        batch.expect_user_error("data_tools.sweep.batch", "other", *arguments)
+        (row,) = rows(batch).values()
+        assert row["status"] == "failed"
+        assert "belongs to the video" in row["message"]
+
+
+@pytest.mark.slow
 def test_killed_batch_ends_its_runs_and_resumes(batch: Toy) -> None:
     runner = batch.start("data_tools.sweep.batch", "videos", "--jobs", "3", TOY_SLEEP_S="60")
     for name in GOOD:
