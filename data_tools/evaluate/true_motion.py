@@ -24,10 +24,11 @@ from jaxtyping import Float
 import stages
 from data_tools.command import run_command
 from data_tools.evaluate.comparison import MatchedRigs
-from data_tools.evaluate.truth import load_ground_truth, read_capture_settings
+from data_tools.evaluate.truth import SAMPLE, load_ground_truth, read_capture_settings
 from data_tools.folder import atomic_folder
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
+from pipeline.core.command import format_module_command
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
 from pipeline.core.manifest import digest_json, digest_video
@@ -81,9 +82,14 @@ def write_true_input(capture: Path, folder: Path) -> None:
     """Make a copy of a capture whose video has the true camera and the true masks beside it.
 
     Raises:
-        UserError: the capture has no ground truth.
+        UserError: the capture has no ground truth, or was filmed with a camera in the hand.
     """
     truth = load_ground_truth(capture)
+    if truth.hand_held_deg:
+        raise UserError(
+            f"{capture} has a hand-held camera (--hand-held-deg {truth.hand_held_deg:g}), its true masks are those of "
+            f"one that stands still; make a capture without this option: {format_module_command(SAMPLE, 'NEW_FOLDER')}"
+        )
     camera = truth.camera
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     calibration = {**numbers, "world_to_camera": camera.world_to_camera.tolist()}

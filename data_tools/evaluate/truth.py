@@ -35,7 +35,7 @@ from pipeline.metrics.images import foreground_mask, mask_iou, psnr_db
 
 MIN_PSNR_DB, MIN_IOU = 45.0, 0.995
 
-_SAMPLE, _FROM_GLTF = "data_tools.sample", "data_tools.from_gltf"
+SAMPLE, _FROM_GLTF = "data_tools.sample", "data_tools.from_gltf"
 """Modules that make captures; `source` in the settings of a capture names the one that made it."""
 
 
@@ -66,6 +66,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         ground_m = np.array(settings["ground_m"], dtype=np.float64).reshape(3)
         light = Light(**{name: _tuple_of(value) for name, value in settings["light"].items()})
         fps, samples = float(settings["fps"]), int(settings["samples"])
+        hand_held_deg = float(settings["hand_held_deg"])
     except (KeyError, TypeError, ValueError):
         raise _damaged_settings_error(out) from None
     subject = load_subject(truth)
@@ -79,6 +80,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         fps=fps,
         samples=samples,
         ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
+        hand_held_deg=hand_held_deg,
         surroundings=make_surroundings(camera, ground_m, settings["background"] == "busy", ValueNoise(settings["seed"]))
         if settings.get("walk_around")
         else None,
@@ -94,7 +96,7 @@ def read_capture_settings(out: Path) -> dict[str, Any]:
     """Read the options and the version of a capture. UserError if the file is absent or damaged."""
     path = out / "truth" / "capture_settings.json"
     if not path.is_file():
-        command = format_module_command(_SAMPLE, out if not out.exists() else "NEW_FOLDER")
+        command = format_module_command(SAMPLE, out if not out.exists() else "NEW_FOLDER")
         raise UserError(f"{path.parent} holds no ground truth; name a synthetic capture, or make one: {command}")
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
@@ -110,7 +112,7 @@ def require_current_version(out: Path, settings: Mapping[str, Any]) -> None:
     if "version" not in settings:
         raise _damaged_settings_error(out)
     if settings["version"] != CAPTURE_VERSION:
-        module = _FROM_GLTF if settings.get("source") == "gltf" else _SAMPLE
+        module = _FROM_GLTF if settings.get("source") == "gltf" else SAMPLE
         raise UserError(
             f"{out} is a capture of version {settings['version']}, this program reads version {CAPTURE_VERSION}; "
             f"remove {out} and make it again: {format_module_command(module, out)} with the options in "
@@ -121,12 +123,12 @@ def require_current_version(out: Path, settings: Mapping[str, Any]) -> None:
 def _damaged_settings_error(out: Path) -> UserError:
     return UserError(
         f"{out / 'truth' / 'capture_settings.json'} is damaged; remove {out} and make the capture again: "
-        f"{format_module_command(_SAMPLE, out)}"
+        f"{format_module_command(SAMPLE, out)}"
     )
 
 
 def load_true_mask(out: Path, frame_index: int) -> UInt8[np.ndarray, "h w"]:
-    """Read the coverage by the person, 0 to 255, of one frame of the video."""
+    """Read the coverage by the person, 0 to 255, in one frame of a camera that stands still."""
     return read_gray(out / "truth" / "masks" / f"{frame_index:06d}.png")
 
 
@@ -148,10 +150,10 @@ def verify_ground_truth(out: Path, frame_stride: int = 1) -> GroundTruthCheck:
     scores = []
     longer_side_px = max(capture.camera.width, capture.camera.height)
     for frame in read_frames(source, lambda index: index % frame_stride == 0, longer_side_px):
-        image, coverage = capture.render_frame(frame.index)
-        stored = foreground_mask(load_true_mask(out, frame.index))
+        image, mask = (capture.as_filmed(still, frame.index) for still in capture.render_frame(frame.index))
+        stored = foreground_mask(capture.as_filmed(load_true_mask(out, frame.index), frame.index))
         full, body = psnr_db(image, frame.rgb), psnr_db(image, frame.rgb, stored)
-        scores.append((full, body, mask_iou(foreground_mask(coverage), stored)))
+        scores.append((full, body, mask_iou(foreground_mask(mask), stored)))
     return GroundTruthCheck(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
 
 

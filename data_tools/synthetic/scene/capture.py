@@ -30,7 +30,7 @@ from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
 
-CAPTURE_VERSION = 2
+CAPTURE_VERSION = 3
 """Increased whenever equal options give other images or the format of `truth/` changes; the Makefile reads it."""
 
 _FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
@@ -43,8 +43,8 @@ class SyntheticCapture:
     Attributes:
         ground_m: point on the floor where the person stands (world).
         samples: antialiasing samples per pixel and axis.
-        hand_held_rad: by how much the camera turns while it films. The ground truth, masks included, is that of a
-            camera that does not turn.
+        hand_held_deg: by how much the camera turns while it films. The ground truth, masks included, is that of a
+            camera that stands still, in the median orientation.
         surroundings: the room if the camera is carried around the person (`motion` has the shifts of its walk): `room`
             is then that of the first frame. None: the camera stays in its place.
     """
@@ -58,7 +58,7 @@ class SyntheticCapture:
     fps: float
     samples: int
     ball: Ball | None = None
-    hand_held_rad: float = 0.0
+    hand_held_deg: float = 0.0
     surroundings: Surroundings | None = None
 
     @cached_property
@@ -98,6 +98,18 @@ class SyntheticCapture:
             ball_transparency = 1.0 - ball[:, :, 3]
             image, coverage = ball[:, :, :3] + ball_transparency[:, :, None] * image, ball_transparency * coverage
         return to_uint8(image), to_uint8(coverage)
+
+    def as_filmed(self, image: UInt8[np.ndarray, "h w *c"], frame_index: int) -> UInt8[np.ndarray, "h w *c"]:
+        """Return an image or mask of the camera that stands still as the camera in the hand takes it."""
+        if not self.hand_held_deg:
+            return image
+        return turn_picture(image, self.camera.fx, self._camera_angles_rad[frame_index])
+
+    @cached_property
+    def _camera_angles_rad(self) -> Float[np.ndarray, "n 3"]:
+        """Pitch, yaw and roll in all frames."""
+        count = len(self.motion.frame_index)
+        return hand_held_angles_rad(count, self.fps, float(np.radians(self.hand_held_deg)))
 
     def _feet_m(self, frame_index: int) -> Float[np.ndarray, "4 3"]:
         """Return the world positions of ankles and balls of the feet."""
@@ -194,12 +206,10 @@ def write_capture(
 
 def _frames(capture: SyntheticCapture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield the images in order and write the mask of each."""
-    count = len(capture.motion.frame_index)
-    angles_rad = hand_held_angles_rad(count, capture.fps, capture.hand_held_rad)
-    for frame_index in track(range(count), "rendering"):
+    for frame_index in track(range(len(capture.motion.frame_index)), "rendering"):
         image, coverage = capture.render_frame(frame_index)
         write_gray(masks / f"{frame_index:06d}.png", coverage)
-        yield turn_picture(image, capture.camera.fx, angles_rad[frame_index]) if capture.hand_held_rad else image
+        yield capture.as_filmed(image, frame_index)
 
 
 def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, settings: dict[str, object]) -> None:
@@ -222,6 +232,7 @@ def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None
         "ground_m": [float(value) for value in capture.ground_m],
         "light": asdict(capture.light),
         "ball": capture.ball is not None,
+        "hand_held_deg": capture.hand_held_deg,
     }
     (truth / "capture_settings.json").write_text(json.dumps({**settings, **metadata}, indent=2, sort_keys=True) + "\n")
 

@@ -12,20 +12,24 @@ PITCH_RATIO, ROLL_RATIO = 0.6, 0.6
 
 
 def hand_held_angles_rad(count: int, fps: float, amplitude_rad: float) -> Float[np.ndarray, "n 3"]:
-    """Return pitch, yaw and roll of each frame; the amplitude is that of yaw. Equal arguments give equal angles."""
+    """Return pitch, yaw and roll of each frame. Equal arguments give equal angles.
+
+    The median of each is zero: the median orientation, to which the pipeline stabilises frames, is that of the ground
+    truth. amplitude_rad: of yaw, about the middle of a long recording.
+    """
     time_s = np.arange(count) / fps
     angles = np.zeros((count, 3))
     for axis, (hertz, ratio) in enumerate(zip(SWAY_HZ, (PITCH_RATIO, 1.0, ROLL_RATIO), strict=True)):
         for frequency, share in zip(hertz, SWAY_SHARES, strict=True):
             phase = 2.0 * axis + 5.0 * frequency
             angles[:, axis] += amplitude_rad * ratio * share * np.sin(2.0 * np.pi * frequency * time_s + phase)
-    return angles
+    return angles - np.median(angles, axis=0)
 
 
 def turn_picture(
-    image: UInt8[np.ndarray, "h w 3"], focal_px: float, angles_rad: Float[np.ndarray, "3"]
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of the turned camera (pitch, yaw, roll); what was not filmed is mirrored at the edge."""
+    image: UInt8[np.ndarray, "h w *c"], focal_px: float, angles_rad: Float[np.ndarray, "3"]
+) -> UInt8[np.ndarray, "h w *c"]:
+    """Return the picture or mask of the turned camera (pitch, yaw, roll); what was not filmed is mirrored."""
     height, width = image.shape[:2]
     # OpenCV's pixel centres are whole numbers.
     to_pixels = np.array([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])

@@ -220,7 +220,7 @@ def build_capture(
         options.fps,
         options.samples,
         ball,
-        float(np.radians(options.hand_held_deg)),
+        options.hand_held_deg,
         make_surroundings(camera, ground_m, options.background == "busy", ValueNoise(options.seed))
         if options.walk_around
         else None,

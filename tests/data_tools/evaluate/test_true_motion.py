@@ -76,6 +76,13 @@ def test_true_input_needs_a_capture(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_camera_in_the_hand_is_refused(hand_held: Path, tmp_path: Path) -> None:
+    """Its frames are turned, the true masks and the camera are not."""
+    with pytest.raises(UserError, match=r"hand-held.* 3.* make a capture without .*data_tools\.sample"):
+        write_true_input(hand_held, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_of_another_video_is_not_taken_over(perfect: Comparison, tmp_path: Path) -> None:
     capture, supplied, run = perfect.folder.parent, tmp_path / "run-true_input", tmp_path / "run"
     run.mkdir()

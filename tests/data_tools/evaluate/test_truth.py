@@ -50,6 +50,11 @@ def test_wrong_ground_truth_is_detected(sample: Path, tmp_path: Path, capsys: py
     assert capsys.readouterr().err.startswith("error: ")
 
 
+def test_ground_truth_of_a_camera_in_the_hand_reproduces_its_video(hand_held: Path) -> None:
+    assert load_ground_truth(hand_held).hand_held_deg == 3.0
+    assert verify_ground_truth(hand_held, frame_stride=2).passes()
+
+
 def test_missing_ground_truth_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"holds no ground truth.*sample NEW_FOLDER"):
         load_ground_truth(tmp_path)
