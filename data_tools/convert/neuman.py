@@ -13,11 +13,10 @@ Only the images and the model are required. The pipeline has one fixed camera: t
 the camera, and the trajectory of the camera is not written.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from data_tools.convert.colmap import ColmapModel, find_colmap_model, read_colmap_model
 from data_tools.convert.joblib_pickle import load_joblib
@@ -49,10 +48,11 @@ def read_neuman(folder: Path) -> Recording:
         raise UserError(f"{folder} has no COLMAP model in sparse/; supply a NeuMan scene")
     source, model = open_frame_source(folder), read_colmap_model(model_folder)
     poses_path = next((folder / name for name in _POSES if (folder / name).is_file()), None)
+    masks = folder / "segmentations"
     has_poses = poses_path is not None and (folder / "alignments.npy").is_file()
     return Recording(
         source=source,
-        read_mask=_mask_reader(folder / "segmentations", source) if (folder / "segmentations").is_dir() else None,
+        read_mask=mask_folder_reader(masks, source, person_is_dark=True) if masks.is_dir() else None,
         camera=_require_single_camera(model, source, model_folder),
         split=_read_split(folder, source),
         poses=_read_poses(poses_path, folder / "alignments.npy", source, model) if poses_path and has_poses else None,
@@ -66,11 +66,6 @@ def _require_single_camera(model: ColmapModel, source: FrameSource, path: Path) 
     one = used.pop()
     require_image_size(source, one.width, one.height, path)
     return one.camera
-
-
-def _mask_reader(folder: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
-    read_background_mask = mask_folder_reader(folder, source)
-    return lambda index: 255 - read_background_mask(index)
 
 
 def _read_split(folder: Path, source: FrameSource) -> dict[str, list[int]] | None:

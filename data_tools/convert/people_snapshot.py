@@ -11,18 +11,17 @@ Only the video is required. The principal point is used unchanged: it is half of
 centre for pixel centres at +0.5.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped
 
 from data_tools.convert.protocol import published_split
-from data_tools.convert.recording import Recording, mask_to_uint8, require_image_size
+from data_tools.convert.recording import Recording, require_image_size, require_mask
 from data_tools.convert.smpl_arrays import gender_from_name, smpl_poses_from_arrays
 from pipeline.capture.smpl_poses import SmplPoses
-from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.user_files import CameraCalibration, MaskReader, scale_masks
 from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.hdf5 import read_dataset, read_whole
@@ -77,7 +76,7 @@ def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Fl
     return CameraCalibration(fx, fy, cx, cy, tuple(distortion)), world_to_camera
 
 
-def _mask_reader(path: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
+def _mask_reader(path: Path, source: FrameSource) -> MaskReader:
     """Return a function that reads one mask; all masks together would not fit into memory."""
     shape = read_dataset(path, "masks", lambda masks: masks.shape)
     if len(shape) != 3 or shape[0] < source.n_frames:
@@ -85,7 +84,11 @@ def _mask_reader(path: Path, source: FrameSource) -> Callable[[int], UInt8[np.nd
             f"{path}: `masks` has shape {shape} for the {source.n_frames} frames of {source.path}; "
             "supply (frames, height, width) masks of this video"
         )
-    return lambda index: mask_to_uint8(read_dataset(path, "masks", lambda masks: masks[index]), path)
+
+    def read_levels(index: int) -> Shaped[np.ndarray, "h w"]:
+        return require_mask(read_dataset(path, "masks", lambda masks: masks[index]), path)
+
+    return scale_masks(read_levels, source.n_frames, str(path))
 
 
 def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: str) -> SmplPoses:

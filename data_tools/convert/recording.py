@@ -12,20 +12,20 @@
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Shaped
 
 from data_tools.folder import atomic_folder
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, save_smpl_poses
-from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.user_files import CameraCalibration, MaskReader, masks_from_folder, match_masks, scale_masks
 from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.io.image import IMAGE_SUFFIXES, read_gray, write_gray
+from pipeline.io.image import write_gray
 from pipeline.io.safe_pickle import load_npy
 
 
@@ -40,7 +40,7 @@ class Recording:
     """
 
     source: FrameSource
-    read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None = None
+    read_mask: MaskReader | None = None
     camera: CameraCalibration | None = None
     split: Mapping[str, Sequence[int]] | None = None
     poses: SmplPoses | None = None
@@ -87,39 +87,32 @@ def write_recording(recording: Recording, target: Path) -> None:
             shutil.copyfile(file, part / file.name)
 
 
-def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
-    """Return a function that reads the mask of a frame index from a folder of images or `.npy` files.
+def mask_folder_reader(folder: Path, source: FrameSource, *, person_is_dark: bool = False) -> MaskReader:
+    """Return a reader of the masks in a folder: of its `.npy` files, or else of its images, as the frames stage does.
 
-    Masks are matched by the names of the images, or else in natural order.
+    person_is_dark: masks are 0 where the person is.
 
     Raises:
-        UserError: the number of masks differs from the number of images.
+        UserError: the masks do not fit the images, are empty or inverted, or an array is no mask.
     """
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    files = sorted((path for path in visible if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES)), key=natural_sort_key)
-    by_stem = {path.stem: path for path in files}
-    if source.files and all(image.stem in by_stem for image in source.files):
-        files = [by_stem[image.stem] for image in source.files]
-    if len(files) != source.n_frames:
-        raise UserError(f"{folder} has {len(files)} masks for {source.n_frames} images; supply one mask per image")
-
-    def read(index: int) -> UInt8[np.ndarray, "h w"]:
-        path = files[index]
-        return mask_to_uint8(load_npy(path) if path.suffix == ".npy" else read_gray(path), path)
-
-    return read
+    arrays = sorted((path for path in visible if path.suffix.lower() == ".npy"), key=natural_sort_key)
+    if not arrays:
+        return masks_from_folder(folder, source, person_is_dark=person_is_dark)
+    files = match_masks(arrays, folder, source)
+    return scale_masks(
+        lambda index: require_mask(load_npy(files[index]), files[index]),
+        len(files),
+        f"{folder}/",
+        person_is_dark=person_is_dark,
+    )
 
 
-def mask_to_uint8(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray, "h w"]:
-    """Convert a stored mask to uint8; the range is [0, 1] if no value exceeds 1, else [0, 255].
-
-    Raises:
-        UserError: the mask is not a numeric (height, width) array.
-    """
-    if mask.ndim != 2 or not np.issubdtype(mask.dtype, np.number) and mask.dtype != bool:
+def require_mask(mask: Shaped[np.ndarray, "..."], path: Path) -> Shaped[np.ndarray, "h w"]:
+    """Return the mask unchanged. UserError if it is no (height, width) array of numbers or truth values."""
+    if mask.ndim != 2 or not mask.size or not np.issubdtype(mask.dtype, np.number) and mask.dtype != bool:
         raise UserError(f"{path}: a mask has shape {mask.shape} and type {mask.dtype}; store (height, width) numbers")
-    values = mask.astype(np.float32)
-    return np.clip(np.rint(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
+    return mask
 
 
 def require_image_size(source: FrameSource, width_px: int, height_px: int, path: Path) -> None:

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 
 from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
 from pipeline.capture.landmarks import N_LANDMARKS
@@ -44,6 +44,9 @@ _MAX_PRINCIPAL_POINT_OFFSET = 0.2
 # So many masks tell the largest level, and whether they show the person.
 _N_MASKS_SAMPLED = 8
 _OWN_ALPHA = "the images' alpha channel"
+MaskReader = Callable[[int], UInt8[np.ndarray, "h w"]]
+"""Returns the mask of a frame, 0 to 255, at the mask's own size."""
+
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
@@ -117,11 +120,9 @@ class UserSplit:
 
 @dataclass(frozen=True)
 class UserFiles:
-    """The inputs that were found; None for the others. `read_mask(index)` returns uint8 [0, 255] at the mask's own
-    size.
-    """
+    """The inputs that were found; None for the others."""
 
-    read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None
+    read_mask: MaskReader | None
     mask_source: str
     landmarks: UserLandmarks | None
     camera: CameraCalibration | None
@@ -156,9 +157,9 @@ def load_user_files(path: Path, source: FrameSource) -> UserFiles:
     )
 
 
-def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.ndarray] | None, str]:
+def _find_masks(path: Path, source: FrameSource) -> tuple[MaskReader | None, str]:
     if (path / "masks").is_dir():
-        return _masks_from_folder(path / "masks", source), "masks/"
+        return masks_from_folder(path / "masks", source), "masks/"
     if (path / "masks.npz").is_file():
         arrays = load_npz(path / "masks.npz")
         if "masks" not in arrays:
@@ -171,7 +172,7 @@ def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.nda
     return None, ""
 
 
-def _masks_from_alpha(path: Path, files: Sequence[Path]) -> Callable[[int], np.ndarray] | None:
+def _masks_from_alpha(path: Path, files: Sequence[Path]) -> MaskReader | None:
     """Return None where no sampled image has transparency."""
     sampled = {k: read_alpha(files[k]) for k in _sampled(len(files))}
     opaque = [k for k, alpha in sampled.items() if alpha.min() == 255]
@@ -191,22 +192,41 @@ def _sampled(n_masks: int) -> list[int]:
     return sorted({int(k) for k in np.linspace(0, n_masks - 1, _N_MASKS_SAMPLED)})
 
 
-def _check_masks(name: str, sampled: Sequence[np.ndarray]) -> float:
+def _check_masks(name: str, sampled: Sequence[np.ndarray], *, person_is_dark: bool = False) -> float:
     """Return the largest level of the sampled masks. Raise UserError where they are empty or inverted."""
     highest = max(float(mask.max()) for mask in sampled)
-    if highest <= 0:
-        raise UserError(f"{name}: all {len(sampled)} masks looked at are empty; masks are white where the person is")
-    n_inverted = sum(bool((mask[[0, 0, -1, -1], [0, -1, 0, -1]] > highest / 2).all()) for mask in sampled)
-    if 2 * n_inverted >= len(sampled):
+    shade, masks = ("black", [highest - mask for mask in sampled]) if person_is_dark else ("white", sampled)
+    if max(float(mask.max()) for mask in masks) <= 0:
+        raise UserError(f"{name}: all {len(masks)} masks looked at are empty; masks are {shade} where the person is")
+    n_inverted = sum(bool((mask[[0, 0, -1, -1], [0, -1, 0, -1]] > highest / 2).all()) for mask in masks)
+    if 2 * n_inverted >= len(masks):
         raise UserError(
-            f"{name}: {n_inverted} of {len(sampled)} masks looked at are white in all four corners, masks are white "
+            f"{name}: {n_inverted} of {len(masks)} masks looked at are {shade} in all four corners, masks are {shade} "
             "where the person is; invert them"
         )
     return highest
 
 
-def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
-    files: Sequence[Path] = images_in(folder)
+def masks_from_folder(folder: Path, source: FrameSource, *, person_is_dark: bool = False) -> MaskReader:
+    """Return a reader of the masks in a folder of images; see `match_masks` and `scale_masks`. Cut-outs: their alpha.
+
+    Raises:
+        UserError: as `match_masks` and `scale_masks`, or some of the images are transparent and others are not.
+    """
+    files = match_masks(images_in(folder), folder, source)
+    if (read_mask := _masks_from_alpha(folder, files)) is not None:
+        return read_mask
+    return scale_masks(
+        lambda index: read_gray_uint16(files[index]), len(files), f"{folder}/", person_is_dark=person_is_dark
+    )
+
+
+def match_masks(files: Sequence[Path], folder: Path, source: FrameSource) -> Sequence[Path]:
+    """Return the file of each frame: that with the name of its image, or all `files` in their order if none has one.
+
+    Raises:
+        UserError: some images have a file of their name and others have none, or the numbers differ.
+    """
     by_stem = {p.stem: p for p in files}
     names = [image.stem for image in source.files]
     if any(name in by_stem for name in names):
@@ -217,13 +237,28 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
             )
         files = [by_stem[name] for name in names]
     _check_frame_count(folder, len(files), source)
-    if (read_mask := _masks_from_alpha(folder, files)) is not None:
-        return read_mask
-    highest = _check_masks(f"{folder}/", [read_gray_uint16(files[k]) for k in _sampled(len(files))])
-    return lambda index: _to_255(read_gray_uint16(files[index]), highest)
+    return files
 
 
-def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
+def scale_masks(
+    read_levels: Callable[[int], Shaped[np.ndarray, "h w"]], count: int, name: str, *, person_is_dark: bool = False
+) -> MaskReader:
+    """Return a reader of masks with one scale: the largest level of some of them becomes 255.
+
+    read_levels: returns one of `count` masks of numbers or truth values. name: of all masks, for messages.
+    person_is_dark: masks are 0 where the person is, and have their largest level elsewhere.
+
+    Raises:
+        UserError: the masks are empty or inverted.
+    """
+    sampled = [read_levels(k) for k in _sampled(count)]
+    highest = _check_masks(name, sampled, person_is_dark=person_is_dark)
+    if person_is_dark:
+        return lambda index: 255 - _to_255(read_levels(index), highest)
+    return lambda index: _to_255(read_levels(index), highest)
+
+
+def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> MaskReader:
     if masks.ndim != 3 or masks.size == 0:
         raise UserError(f"{path}: the masks have shape {masks.shape}; store them as (frames, height, width)")
     _check_frame_count(path, len(masks), source)
@@ -233,8 +268,8 @@ def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Cal
 
 
 def _to_255(mask: np.ndarray, highest: float) -> UInt8[np.ndarray, "h w"]:
-    """Return a mask whose level `highest` becomes 255, as do those above it."""
-    return np.rint(np.minimum(mask.astype(np.float32) * 255.0 / highest, 255.0)).astype(np.uint8)
+    """Return a mask whose level `highest` becomes 255, as do those above it; those below 0 become 0."""
+    return np.rint(np.clip(mask.astype(np.float32) * 255.0 / highest, 0.0, 255.0)).astype(np.uint8)
 
 
 def _read_hdf5_masks(path: Path) -> np.ndarray:

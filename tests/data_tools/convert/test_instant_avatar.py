@@ -111,7 +111,7 @@ def test_image_masks_without_poses(folder):
         write_gray(folder / "masks" / f"{k}.png", 200 * mask)
     (folder / "poses.npz").unlink()
     recording = read_instant_avatar(folder)
-    np.testing.assert_array_equal(recording.read_mask(3), 200 * sample_data.masks(6)[3])
+    np.testing.assert_array_equal(recording.read_mask(3), 255 * sample_data.masks(6)[3])
     assert recording.poses is None
 
 
@@ -123,7 +123,7 @@ def test_inconsistent_files_are_errors(folder):
     with pytest.raises(UserError, match="the translation must have 6 rows of 3 numbers, found None"):
         read_instant_avatar(folder)
     (folder / "masks" / "mask_0003.npy").unlink()
-    with pytest.raises(UserError, match="5 masks for 6 images"):
+    with pytest.raises(UserError, match="masks has 5 entries for 6 frames"):
         read_instant_avatar(folder)
     np.savez(folder / "cameras.npz", intrinsic=np.eye(3), extrinsic=np.eye(4), height=540, width=540)
     with pytest.raises(UserError, match="for images of 540x540, but those of .* are 16x12"):

@@ -104,7 +104,7 @@ def test_splits_by_image_name(scene, tmp_path):
 
 def test_inconsistent_files_are_errors(scene):
     (scene / "segmentations" / "00002.png").unlink()
-    with pytest.raises(UserError, match="5 masks for 6 images"):
+    with pytest.raises(UserError, match="with the names of images, but none for 00002"):
         read_neuman(scene)
     dump_joblib(
         {1: {"pose": sample_data.numbers("pose", 3), "betas": np.zeros((3, 10))}}, scene / "smpl_output_romp.pkl"

@@ -113,6 +113,17 @@ def test_invalid_masks_and_poses_are_errors(tmp_path):
         read_people_snapshot(tmp_path / "s")
 
 
+def test_one_scale_holds_for_all_masks(tmp_path):
+    """Noise of one level is not the person where the person has left the picture."""
+    sample_data.people_snapshot(tmp_path / "s")
+    masks = 255 * sample_data.masks(6)
+    masks[4], masks[4, ::3, ::2] = 0, 1
+    with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
+        file["masks"] = masks
+    read = read_people_snapshot(tmp_path / "s").read_mask
+    np.testing.assert_array_equal([read(k) for k in range(6)], masks)
+
+
 def test_poses_of_a_longer_video_are_an_error(tmp_path):
     sample_data.people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "reconstructed_poses.hdf5", "a") as file:
