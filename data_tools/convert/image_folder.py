@@ -4,20 +4,21 @@
     masks/, mask/, matte/, ...                   one mask per image, with the same names or in the same order; the
                                                  person is bright
 
-`camera.json`, `split.json` and `landmarks.npz` in the format of `pipeline.capture.user_files` are copied. A folder with
-`masks/`, or with alpha in its images, needs no conversion.
+`camera.json`, `split.json`, `landmarks.npz` and `smpl_poses.npz` in the format of `pipeline.capture.user_files` are
+copied. A folder with `masks/`, or with alpha in its images, needs no conversion.
 """
 
 from pathlib import Path
 
 from data_tools.convert.recording import Recording, mask_folder_reader
+from pipeline.capture.smpl_poses import SMPL_POSES_NPZ
 from pipeline.capture.video import open_frame_source
 from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_alpha
 
 _MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "alpha", "segmentations", "segmentation")
-_FILES_TO_COPY = ("camera.json", "split.json", "landmarks.npz")
+_FILES_TO_COPY = ("camera.json", "split.json", "landmarks.npz", SMPL_POSES_NPZ)
 
 
 def is_image_folder(folder: Path) -> bool:

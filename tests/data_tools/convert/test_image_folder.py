@@ -7,10 +7,13 @@ import pytest
 
 from data_tools.convert.image_folder import is_image_folder, read_image_folder
 from data_tools.convert.recording import write_recording
+from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_rgb, write_rgba
+from pipeline.io.npz import save_npz
+from tests.capture.test_smpl_poses import make_poses
 from tests.data_tools.convert import sample_data
 
 
@@ -30,6 +33,18 @@ def test_mask_folder_names(tmp_path, name):
     (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
     write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
     assert check(tmp_path / "out").camera.fx == 9
+
+
+def test_all_files_in_the_format_of_the_target_are_copied(tmp_path):
+    """All that a run reads from the folder, besides images and masks."""
+    sample_data.write_image_folder(tmp_path / "in", "matte")
+    (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
+    (tmp_path / "in" / "split.json").write_text(json.dumps({"train": [0, 1, 2, 3, 4], "heldout": [5]}))
+    save_npz(tmp_path / "in" / "landmarks.npz", {"landmarks_px": np.ones((6, 33, 2))})
+    save_smpl_poses(tmp_path / "in" / "smpl_poses.npz", make_poses(2))
+    write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
+    files = check(tmp_path / "out")
+    assert all(found is not None for found in (files.camera, files.split, files.landmarks, files.smpl_poses))
 
 
 def test_masks_in_the_alpha_channel(tmp_path):
