@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from data_tools.folder import replaced_folder
+from data_tools.folder import result_folder
 from data_tools.pose import export_config
 from pipeline.avatar.skinned_avatar import to_rest_pose
 from pipeline.core.manifest import read_manifest
@@ -49,7 +49,7 @@ def write_edited_avatar(
     scene, config = avatar.scene, avatar.config
     face = make_face(scene.body, scene.template, scene.skinned, texture) if config.face else None
     edited = replace(scene, texture=texture, face=face)
-    with replaced_folder(out) as part:
+    with result_folder(out) as part:
         save_maps(part, texture, avatar.texture_format)
         (part / "avatar.glb").write_bytes(encode_scene(edited, config, edited.clips()))
         write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from data_tools.command import run_command
-from data_tools.folder import replaced_folder
+from data_tools.folder import result_folder
 from data_tools.pose import check_folder_name, export_config, play_bvh
 from data_tools.synthetic.scene.movie import FOR_PLAYERS, write_video
 from pipeline.avatar.film import FPS, render_film, turntable_motion
@@ -30,20 +30,22 @@ from stages import export
 from stages.export import Scene, load_scene
 
 TURNTABLE = "turntable"
+CLIPS = (TURNTABLE, "capture", "idle")
+"""What every avatar can be filmed with."""
 MIN_FRAMES = 2
 
 
 def main(argv: Sequence[str]) -> None:
     """Render one film."""
     options = _parse_options(argv)
-    name = check_folder_name(options.name) if options.name else Path(options.clip or TURNTABLE).stem
+    name = check_folder_name(options.name) if options.name else _default_name(options.clip)
     _check_clip(options.clip)
     inputs = {name: options.run / name for name in export.STAGE.needs}
     # The film shows the captured surface: five seconds for a face that moves would be for nothing.
     scene = load_scene(inputs, export_config(options.run).model_copy(update={"face": False}))
     motion = film_motion(options.clip, scene, options.in_place)
     avatar = load_textured_avatar(inputs["mesh"], inputs["texture"])
-    with replaced_folder(options.run / "film" / name) as out:
+    with result_folder(options.run / "film" / name) as out:
         frames = render_film(avatar, scene.body, motion)
         write_video(out / "film.mp4", _ahead(track(frames, "frames of the film", len(motion.time_s))), FPS, FOR_PLAYERS)
     print(f"{options.run / 'film' / name / 'film.mp4'}: {len(motion.time_s) / FPS:.1f} s, {len(motion.time_s)} frames")
@@ -75,11 +77,19 @@ def film_motion(clip: str | None, scene: Scene, in_place: bool = False) -> Motio
 
 def _check_clip(clip: str | None) -> None:
     """Raise UserError for a clip that does not exist, before anything is read."""
-    if clip is None or clip in (TURNTABLE, "capture", "idle"):
+    if clip is None or clip in CLIPS:
         return
     if Path(clip).suffix.lower() != ".bvh":
         raise UserError(f"there is no clip {clip}; choose capture, idle or {TURNTABLE}, or name a .bvh file")
     require_bvh_file(Path(clip))
+
+
+def _default_name(clip: str | None) -> str:
+    """Return the name of the clip, or of its file. UserError if a file has that of a clip that every avatar has."""
+    name = Path(clip or TURNTABLE).stem
+    if clip not in (None, *CLIPS) and name in CLIPS:
+        raise UserError(f"{name} is the name of a film that every avatar has; name that of {clip} with --name")
+    return name
 
 
 def _ahead(frames: Iterator[UInt8[np.ndarray, "h w 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32
 
 from data_tools.command import run_command
-from data_tools.folder import replaced_folder
+from data_tools.folder import result_folder
 from pipeline.avatar.motion.bvh_export import motion_to_bvh
 from pipeline.avatar.motion.feet import find_contacts, snap_feet_to_floor, sole_positions_m
 from pipeline.avatar.motion.planting import plant_feet
@@ -53,7 +53,7 @@ def main(argv: Sequence[str]) -> None:
     scene = load_scene(inputs, config)
     clips = {path.stem: play_bvh(path, body, scene.floor_y_m, options.in_place) for path in options.bvh}
     posed = _chosen_pose(options, scene, clips)
-    with replaced_folder(options.run / "pose" / name) as out:
+    with result_folder(options.run / "pose" / name) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
         if clips:
             (out / "avatar.glb").write_bytes(encode_scene(scene, config, scene.clips() | clips))

@@ -16,7 +16,7 @@ import numpy as np
 
 from data_tools.command import run_command
 from data_tools.edited_avatar import EditableAvatar, load_editable_avatar
-from data_tools.folder import replaced_folder
+from data_tools.folder import result_folder
 from data_tools.pose import check_folder_name
 from pipeline.avatar.placement import FLOOR_PERCENTILE, translate_motion
 from pipeline.avatar.rig import build_rig
@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
             "without morph targets, the rest is complete; a smaller change keeps the face"
         )
     out = options.run / "reshape" / name
-    with replaced_folder(out) as part:
+    with result_folder(out) as part:
         (part / "avatar.glb").write_bytes(encode_scene(scene, avatar.config, scene.clips()))
         write_scene_obj(options.run / "texture", part, scene.texture, to_rest_pose(scene.skinned, scene.rig))
     print(f"{out}: avatar.glb, avatar.obj")

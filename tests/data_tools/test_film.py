@@ -146,3 +146,11 @@ def test_a_film_for_players_has_half_chroma_and_true_colours(tmp_path: Path) -> 
         assert decoded.colorspace == 1  # ITU-R BT.709
     (shown,) = read_film(tmp_path / "colours.mp4")[:1]
     assert np.abs(shown[16:48, 16:48].astype(int) - colours[0]).max() <= 4
+
+
+@pytest.mark.parametrize("name", ["capture", "idle", "turntable"])
+def test_a_file_does_not_replace_the_film_of_a_clip(run: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / f"{name}.bvh").write_text("HIERARCHY")
+    with pytest.raises(UserError, match=f"{name} is the name of a film .* --name"):
+        main([str(run), "--clip", str(tmp_path / f"{name}.bvh")])
+    assert not (run / "film").exists()
