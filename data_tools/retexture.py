@@ -24,9 +24,10 @@ from data_tools.pose import check_folder_name
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.geometry.atlas import rasterize_texels
+from pipeline.io.image import read_rgb_float
 from pipeline.template.layout import load_layout
 from pipeline.template.texture_exchange import RegisteredSurface, exchanged_map
-from pipeline.texture.files import ATLAS, TextureArtifact, load_texture
+from pipeline.texture.files import ATLAS, ROUGHNESS, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.painting import Painting, enlarge_maps, paint_over, read_mask, read_painting, resize_map
 
 _FOLDERS_OF_MAPS = ("texture", "export", "retexture", "stylise", "reshape", "pose")
@@ -38,13 +39,14 @@ def main(argv: Sequence[str]) -> None:
     options = _parse_options(argv)
     if options.diffuse is not None and options.mask is not None:
         raise UserError("--mask is for the texture of another run; with --diffuse, paint alpha instead")
-    chosen = options.mask or options.diffuse or options.other
-    name = check_folder_name(options.name) if options.name else Path(chosen).resolve().stem
+    image = options.mask or options.diffuse
+    name = image.stem if image else options.other.resolve().name
+    name = check_folder_name(options.name) if options.name else name
     if options.diffuse is not None:
         painting = read_painting(options.diffuse)
         avatar = load_editable_avatar(options.run)
         painting = fit_painting(painting, options.diffuse, options.run, avatar.scene.texture)
-        texture = paint_over(avatar.scene.texture, painting)
+        texture = paint_over(with_maps_beside(avatar.scene.texture, options.diffuse, options.run), painting)
     else:
         mask = None if options.mask is None else read_mask(options.mask)
         avatar, other = load_editable_avatar(options.run), load_editable_avatar(options.other)
@@ -85,6 +87,28 @@ def run_of_map(path: Path) -> Path | None:
         if name in _FOLDERS_OF_MAPS and (run / "texture" / ATLAS).is_file() and not path.name.startswith("wrapped_"):
             return run
     return None
+
+
+def with_maps_beside(texture: TextureArtifact, path: Path, run: Path) -> TextureArtifact:
+    """Return the run's texture with the highlights of its edited avatar whose map is edited further.
+
+    Args:
+        texture: of the run.
+        path: a painting; the maps beside it count if it is in a result of `retexture` or `stylise` of this run.
+    """
+    folder, source = path.resolve().parent, run_of_map(path)
+    is_edited = folder.parent.name in ("retexture", "stylise") and (folder / SPECULAR).is_file()
+    if not is_edited or source is None or source.resolve() != run.resolve():
+        return texture
+    specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
+    roughness = read_rgb_float(folder / ROUGHNESS)[..., 0]
+    texture = enlarge_maps(texture, len(specular))
+    side_px = len(texture.diffuse)
+    return replace(
+        texture,
+        specular=np.ascontiguousarray(resize_map(specular, side_px)),
+        roughness=np.ascontiguousarray(resize_map(roughness, side_px)) if len(roughness) > 1 else None,
+    )
 
 
 def registered_surface(avatar: EditableAvatar, run: Path) -> RegisteredSurface:

@@ -14,7 +14,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, digest_files, write_manifest
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_gray, read_rgb, read_rgb_float, to_uint16, write_rgb, write_rgba
+from pipeline.io.image import read_gray, read_rgb, read_rgb_float, to_uint16, write_gray, write_rgb, write_rgba
 from pipeline.mesh.files import load_mesh
 from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
@@ -65,6 +65,50 @@ def test_paint_keeps_highlights_and_their_roughness(run: Path, tmp_path: Path) -
     rows = np.abs(np.arange(SIDE_PX) - SIDE_PX // 2) > SIDE_PX // 16
     for pixels in (embedded, read_gray(out / "roughness.png"), read_gray(out / "avatar_roughness.png")):
         assert (pixels[:, :SIDE_PX] == expected)[rows].all()
+
+
+def test_the_map_of_an_edited_avatar_is_edited_further_with_its_highlights(run: Path) -> None:
+    """The clothes of the other person are matt; the painting lies where an artist saves it."""
+    texture = load_texture(run / "texture")
+    side_px = len(texture.diffuse)
+    lobe = Highlights(np.array([0.0, 0.0, 1.0], np.float32), 30.0)
+    shiny = np.full((side_px, side_px), 0.1, np.float32)
+    save_texture(run / "texture", replace(texture, specular=shiny, highlights=lobe, roughness=4.0 * shiny))
+    worn, matt = run / "retexture" / "other", np.zeros((SIDE_PX, SIDE_PX), np.uint8)
+    worn.mkdir(parents=True)
+    write_gray(worn / "specular.png", matt)
+    write_gray(worn / "roughness.png", matt + 204)
+    write_rgb(worn / "logo.png", np.full((SIDE_PX, SIDE_PX, 3), 90, np.uint8))
+    main([str(run), "--diffuse", str(worn / "logo.png")])
+    assert not read_gray(run / "retexture" / "logo" / "specular.png").any()
+    assert (read_gray(run / "retexture" / "logo" / "roughness.png") == 204).all()
+    shutil.copy(worn / "logo.png", run / "plain.png")
+    main([str(run), "--diffuse", str(run / "plain.png")])
+    assert read_gray(run / "retexture" / "plain" / "specular.png").min() == 26
+
+
+def test_a_map_edited_in_place_is_not_replaced(run: Path, tmp_path: Path) -> None:
+    paint = np.full((SIDE_PX, SIDE_PX, 3), 90, np.uint8)
+    write_rgb(tmp_path / "diffuse.png", paint)
+    main([str(run), "--diffuse", str(tmp_path / "diffuse.png")])
+    edited = run / "retexture" / "diffuse" / "diffuse.png"
+    write_rgb(edited, paint + 1)
+    with pytest.raises(UserError, match="diffuse.png was edited and would be replaced: .* --name"):
+        main([str(run), "--diffuse", str(edited)])
+    assert (read_rgb(edited) == 91).all()
+    main([str(run), "--diffuse", str(edited), "--name", "second"])
+    assert (run / "retexture" / "second" / "avatar.glb").is_file()
+
+
+def test_the_result_has_the_whole_name_of_the_other_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = []
+    monkeypatch.setattr("data_tools.retexture.load_editable_avatar", lambda _: None)
+    monkeypatch.setattr("data_tools.retexture.registered_surface", lambda *_: None)
+    monkeypatch.setattr("data_tools.retexture.wear_texture_of", lambda *_: None)
+    monkeypatch.setattr("data_tools.retexture.write_edited_avatar", lambda *arguments: names.append(arguments[2].name))
+    for name in ("anna.1", "anna.2"):
+        main([str(run), "--from", str(run.parent / name)])
+    assert names == ["anna.1", "anna.2"]
 
 
 @pytest.mark.parametrize("texture_format", ["png16", "exr"])
