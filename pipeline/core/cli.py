@@ -12,6 +12,7 @@ from pipeline.core.command import format_command, program_name
 from pipeline.core.config import CONFIG_DIR, build_config, default_yaml, load_layers, parse_overrides
 from pipeline.core.errors import EXIT_USER_ERROR, UserError, format_os_error
 from pipeline.core.events import send_event, send_progress
+from pipeline.core.manifest import require_matching_stages
 from pipeline.core.parent import die_with_parent, is_runner_child
 from pipeline.core.pipeline import Pipeline
 from pipeline.core.preparation import prepare_machine
@@ -63,6 +64,7 @@ def _run_single_stage(stage: Stage, argv: Sequence[str], config_dir: Path) -> No
         layers = load_layers(run.record.preset, run.record.overrides, config_dir)
         config = build_config(stage.name, stage.config, layers)
         plan = plan_stage(stage, config, options.run, run.record.video_path)
+        require_matching_stages(options.run, stage.needs)
         with run.recorded_for(stage):
             has_run = run_stage(plan, options.force)
     if not is_runner_child():

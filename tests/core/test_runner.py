@@ -122,3 +122,14 @@ def test_events_are_lines_of_their_own(monkeypatch: pytest.MonkeyPatch, capsys: 
     line, rest = capsys.readouterr().out.split("\n")
     assert (parse_event(line), rest) == ({"label": "a\nb", "done": 1, "total": None}, "")
     assert parse_event("output of a library") is None
+
+
+def test_a_stage_alone_refuses_results_that_do_not_belong_together(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt", "--set", "summarise.word=value")
+    toy.video.write_text("4 5\n")
+    toy.stages("read", "runs/a")
+    sentence = toy.expect_user_error("stages", "summarise", "runs/a", "--set", "summarise.word=number")
+    assert "runs/a/learn was made from another result of read" in sentence
+    assert sentence.endswith("python -m stages --run runs/a")
+    assert toy.all().returncode == 0
+    assert toy.stages("summarise", "runs/a").stdout == "runs/a/summarise: cached\n"
