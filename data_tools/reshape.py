@@ -20,7 +20,7 @@ from data_tools.folder import result_folder
 from data_tools.pose import check_folder_name
 from pipeline.avatar.placement import FLOOR_PERCENTILE, translate_motion
 from pipeline.avatar.rig import build_rig
-from pipeline.avatar.skinned_avatar import lowest_vertex_y_m, to_rest_pose
+from pipeline.avatar.skinned_avatar import lowest_vertex_y_m, stand_on_soles, to_rest_pose
 from pipeline.body.body import Motion
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
@@ -77,7 +77,7 @@ def reshape_scene(avatar: EditableAvatar, changes: Mapping[str, float], run: Pat
         scene,
         body=body,
         skinned=skinned,
-        rig=build_rig(body, config.rig, config.rest_pose),
+        rig=stand_on_soles(build_rig(body, config.rig, config.rest_pose), skinned),
         template=template,
         face=make_face(body, template, skinned, scene.texture) if config.face else None,
     )

@@ -25,7 +25,13 @@ from pipeline.avatar.placement import (
 )
 from pipeline.avatar.rig import RestPose, Rig, build_rig
 from pipeline.avatar.rig_names import RigName
-from pipeline.avatar.skinned_avatar import a_pose_floor_y_m, build_skinned_mesh, lowest_vertex_y_m, to_rest_pose
+from pipeline.avatar.skinned_avatar import (
+    a_pose_floor_y_m,
+    build_skinned_mesh,
+    lowest_vertex_y_m,
+    stand_on_soles,
+    to_rest_pose,
+)
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -118,7 +124,7 @@ class Scene:
     Attributes:
         body: in the A-pose.
         skinned: the mesh in the A-pose, cut for the atlas.
-        rig: names, axes and rest pose of the joints.
+        rig: names, axes and rest pose of the joints; there the lowest vertex is at y = 0.
         texture: atlas and maps.
         template: on the person; None for a body of a model file.
         motion: of the video, on a floor at y = 0, with the duration of the video.
@@ -190,7 +196,7 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
     return Scene(
         body=body,
         skinned=skinned,
-        rig=build_rig(body, config.rig, config.rest_pose),
+        rig=stand_on_soles(build_rig(body, config.rig, config.rest_pose), skinned),
         texture=texture,
         template=template,
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
@@ -242,9 +248,8 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
         source = creases.source[atlas.vertex_of_uv]
-        displacements_m = face.displacements_m[:, source]
+        displacements_m, turns = face.displacements_m[:, source], face.normal_changes[:, source]
         eyes_m = eye_centres_m(at_rest.mesh.vertices, face.eyeballs)
-        turns = face.normal_changes[:, source]
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
     if config.shape_keys:
         mesh = add_shape_keys(mesh, scene, atlas, creases)
@@ -290,7 +295,8 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
     texture = scene.texture
     captured = CapturedSurface(scene.skinned.mesh, texture.atlas, texture.diffuse, texture.specular, texture.roughness)
     wrapped = wrap_template(scene.body, scene.template.registration, captured)
-    at_rest = to_rest_pose(wrapped.skinned, scene.rig)
+    rig = stand_on_soles(scene.rig, wrapped.skinned)
+    at_rest = to_rest_pose(wrapped.skinned, rig)
     vertices = at_rest.mesh.vertices
     mesh = build_skinned_mesh(at_rest, wrapped.atlas)
     if wrapped.names:
@@ -298,7 +304,7 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
         moved_m = wrapped.displacements_m[:, wrapped.atlas.vertex_of_uv]
         mesh = replace(mesh, morphs=MorphTargets(wrapped.names, moved_m, eyes_m))
     maps = material_maps(texture, config, wrapped)
-    (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, scene.clips(), maps, scene.camera, scene.extras))
+    (out / "wrapped.glb").write_bytes(encode_glb(mesh, rig, scene.clips(), maps, scene.camera, scene.extras))
     write_rgb(out / f"wrapped_{DIFFUSE}", to_uint8(wrapped.diffuse))
     names = ObjMaps(f"wrapped_{DIFFUSE}", exponent=texture.highlights.exponent)
     if wrapped.specular.any():
@@ -382,7 +388,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=17,
+    version=18,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -126,17 +126,13 @@ class Rig:
 
         Linear blend skinning of the result into the A-pose gives back the positions exactly.
         """
-        if np.allclose(self.bind_to_rest, np.eye(4)):
-            return positions_m
         matrices = inverse_skinning_matrices(joint_indices, joint_weights, self.bind_to_rest)
         positions = np.einsum("vab,vb->va", matrices[:, :3, :3], positions_m) + matrices[:, :3, 3]
         return positions.astype(np.float32)
 
 
 def build_rig(body: Body, rig: RigName = "plain", rest_pose: RestPose = "a") -> Rig:
-    """Return the skeleton of a body in the names and axes of `rig`.
-
-    The T-pose has its feet at the height of the A-pose.
+    """Return the skeleton of a body in the names and axes of `rig`, with the hips where they are in the A-pose.
 
     Args:
         body: joints with Mixamo's names; a joint with another name has the axes of the torso.
@@ -145,24 +141,13 @@ def build_rig(body: Body, rig: RigName = "plain", rest_pose: RestPose = "a") -> 
     """
     to_t_pose = t_pose_transforms(body.joint_names, body.parents, body.joints_m)
     t_axes = np.stack([_t_pose_axes(name, rig) for name in body.joint_names])
-    bind_to_rest = np.tile(np.eye(4), (len(t_axes), 1, 1))
-    if rest_pose == "t":
-        bind_to_rest = to_t_pose.copy()
-        bind_to_rest[:, 1, 3] -= _foot_rise_m(body, to_t_pose)
     return Rig(
         body,
         tuple(rig_joint_name(name, rig) for name in body.joint_names),
         "root" if rig == "unreal" else None,
         to_t_pose[:, :3, :3].transpose(0, 2, 1) @ t_axes,
-        bind_to_rest,
+        to_t_pose if rest_pose == "t" else np.tile(np.eye(4), (len(t_axes), 1, 1)),
     )
-
-
-def _foot_rise_m(body: Body, transforms: Float[np.ndarray, "j 4 4"]) -> float:
-    """Return the mean rise of the ankles by the transforms; 0 without feet."""
-    feet = [joint for joint, name in enumerate(body.joint_names) if name.endswith("Foot")]
-    moved = (transforms[feet, :3, :3] @ body.joints_m[feet, :, None])[..., 0] + transforms[feet, :3, 3]
-    return float((moved - body.joints_m[feet])[:, 1].mean()) if feet else 0.0
 
 
 def _t_pose_axes(name: str, rig: RigName) -> Float[np.ndarray, "3 3"]:

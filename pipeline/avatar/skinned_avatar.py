@@ -37,6 +37,13 @@ def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
     return replace(skinned, mesh=Mesh(positions_m, mesh.faces))
 
 
+def stand_on_soles(rig: Rig, skinned: MeshArtifact) -> Rig:
+    """Return the rig with the lowest vertex of the mesh at y = 0 in the rest pose; clips place the root themselves."""
+    bind_to_rest = rig.bind_to_rest.copy()
+    bind_to_rest[:, 1, 3] -= to_rest_pose(skinned, rig).mesh.vertices[:, 1].min()
+    return replace(rig, bind_to_rest=bind_to_rest)
+
+
 def a_pose_floor_y_m(skinned: MeshArtifact) -> float:
     """Return the floor (m) at which feet must stand that are at their height in the A-pose, for soles at y = 0.
 

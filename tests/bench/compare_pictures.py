@@ -75,10 +75,11 @@ def main(argv: Sequence[str]) -> None:
 def compare_in_three(run: Path, out: Path) -> str:
     """Compare the .glb in the rest pose and in a pose of the clip `capture`."""
     avatar, scene = load_textured_avatar(run / "mesh", run / "texture"), _scene(run)
+    standing = _on_floor(avatar)
     row = int(CLIP_FRACTION * len(scene.motion.time_s))
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([row])))[0]
     poses = {
-        "rest": (avatar.vertices, -1, 0.0),
+        "rest": (standing.vertices, -1, 0.0),
         "capture": (avatar.pose_vertices(pose), 0, float(scene.motion.time_s[row])),
     }
     parts = []
@@ -103,7 +104,7 @@ def compare_lit(run: Path, out: Path) -> str:
     inputs = {name: run / name for name in STAGE.needs}
     config = Config(face=False)
     scene = load_scene(inputs, config)
-    plain = load_textured_avatar(run / "mesh", run / "texture")
+    plain = _on_floor(load_textured_avatar(run / "mesh", run / "texture"))
     matte = replace(scene.texture, specular=np.zeros_like(scene.texture.specular))
     shiny = replace(
         scene.texture,
@@ -159,7 +160,7 @@ def _render_lit(
 
 def compare_obj(run: Path, out: Path) -> str:
     """Compare the .obj in trimesh and Blender."""
-    obj, avatar = run / "export" / "avatar.obj", load_textured_avatar(run / "mesh", run / "texture")
+    obj, avatar = run / "export" / "avatar.obj", _on_floor(load_textured_avatar(run / "mesh", run / "texture"))
     camera = camera_for(avatar.vertices)
     loaded = trimesh.load(obj, process=False)
     uv, colours = loaded.visual.uv, np.asarray(loaded.visual.material.image.convert("RGB"), np.float32) / 255.0
@@ -217,6 +218,13 @@ def _offset_mm(avatar: TexturedAvatar, vertices_m: np.ndarray) -> str:
     distance_m = cKDTree(avatar.vertices.numpy()).query(vertices_m)[0].max()
     back_m = cKDTree(vertices_m).query(avatar.vertices.numpy())[0].max()
     return f"{1e3 * max(distance_m, back_m):.4f} mm"
+
+
+def _on_floor(avatar: TexturedAvatar) -> TexturedAvatar:
+    """Return the avatar with its lowest vertex at y = 0, as the exported files have it in the rest pose."""
+    vertices = avatar.vertices.clone()
+    vertices[:, 1] -= vertices[:, 1].min()
+    return replace(avatar, vertices=vertices)
 
 
 def _scene(run: Path) -> Scene:

@@ -19,7 +19,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning, top_k_weights
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_gray, read_rgb, to_float, write_gray, write_rgb
-from pipeline.mesh.files import MeshArtifact, save_mesh
+from pipeline.mesh.files import MeshArtifact, load_mesh, save_mesh
 from pipeline.template.files import TEMPLATE_NPZ, save_template
 from pipeline.template.regions import template_quads
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
@@ -264,6 +264,37 @@ def test_the_t_pose_is_that_of_both_files_and_the_clips_are_the_same(
             for file, name in ((player, one), (other, two))
         ]
         np.testing.assert_allclose(*places, atol=2e-5)
+
+
+@pytest.mark.parametrize("rest_pose", ["a", "t"])
+def test_the_rest_pose_of_every_file_stands_on_the_soles_of_the_shoes(
+    rest_pose: str, inputs: dict[str, Path], scene: PaintedScene, tmp_path: Path
+) -> None:
+    """They are 2 cm below the feet of the body model, which stand on y = 0 in the canonical space; clips stay."""
+    mesh, out = shutil.copytree(inputs["mesh"], tmp_path / "mesh"), tmp_path / "export"
+    out.mkdir()
+    whole = load_mesh(mesh)
+    vertices = whole.mesh.vertices.copy()
+    vertices[:, 1] -= 0.02 * (vertices[:, 1] < vertices[:, 1].min() + 0.05)
+    save_mesh(mesh, replace(whole, mesh=Mesh(vertices, whole.mesh.faces)))
+    EXPORT.run(inputs | {"mesh": mesh}, out, EXPORT.config(rest_pose=rest_pose, topology="template", face=False))
+    for path in sorted(out.glob("*.glb")):
+        part = GlbFile(path).skinned_primitives()[0]
+        assert part.positions[:, 1].min() == pytest.approx(0.0, abs=5e-4), path
+        rest = Player(path)
+        rest.json["animations"] = [{"channels": []}]
+        np.testing.assert_allclose(rest.posed_vertices(0.0), part.positions, atol=5e-6)
+        assert validator_issues(path) == []
+    for path in sorted(out.glob("*.obj")):
+        heights = [float(line.split()[2]) for line in path.read_text().splitlines() if line.startswith("v ")]
+        assert min(heights) == pytest.approx(0.0, abs=5e-4), path
+    player = Player(out / "avatar.glb")
+    transforms = canonical_to_world(scene.body, scene.motion)[FRAME : FRAME + 1]
+    weights = whole.dense_skin_weights(len(scene.body.joint_names))
+    world = linear_blend_skinning(torch.from_numpy(vertices), weights, transforms)[0].numpy()
+    world += player.json["asset"]["extras"]["world_to_scene_translation_m"]
+    played = player.posed_vertices(scene.motion.time_s[FRAME])
+    np.testing.assert_allclose(played, world[load_texture(inputs["texture"]).atlas.vertex_of_uv], atol=2e-5)
 
 
 def test_the_wrapped_template_is_written_as_quads_and_as_an_animated_glb(
