@@ -167,12 +167,18 @@ def _walk(folder: Path, above: frozenset[Path]) -> Iterator[Path]:
 
 
 def find_damaged_files(folder: Path) -> list[str]:
-    """Compare a folder with its manifest: return the paths of missing, changed and unknown files, sorted."""
+    """Compare a folder with its manifest: return the paths of missing and changed outputs, sorted.
+
+    Other files, such as a user's scene, are no damage.
+    """
     manifest = read_manifest(folder)
     if manifest is None:
         return [MANIFEST_FILE]
-    found = digest_files(folder)
-    return sorted(name for name in found.keys() | manifest.outputs if found.get(name) != manifest.outputs.get(name))
+    return sorted(
+        name
+        for name, digest in manifest.outputs.items()
+        if not (folder / name).is_file() or digest_file(folder / name) != digest
+    )
 
 
 def _is_hidden(name: str) -> bool:

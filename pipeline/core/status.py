@@ -41,7 +41,7 @@ def verify_artifacts(pipeline: Pipeline, run_dir: Path) -> str:
     """Digest every finished artifact again and return a table of the complete ones.
 
     Raises:
-        UserError: files are missing, changed or unknown; the message names the command that makes the stage again.
+        UserError: outputs are missing or changed; the message names the command that makes the stage again.
     """
     finished = [name for name in pipeline.names if (run_dir / name).exists()]
     for name in finished:

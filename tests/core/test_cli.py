@@ -86,6 +86,7 @@ def test_stages_run_one_by_one_make_the_same(toy: Toy) -> None:
 
 def test_verify_finds_a_changed_file(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
+    (toy.run_dir / "learn" / "scene.blend").write_text("of the user")
     assert toy.all("--verify").stdout.count("intact") == 3
     (toy.run_dir / "learn" / "trail" / "state.json").write_text("{}")
     sentence = toy.expect_user_error("stages", "--run", "runs/a", "--verify")
