@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, is_dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -26,11 +26,10 @@ PRESET_SUFFIXES = (".yaml", ".yml")
 FILE_OPTION_SUFFIX = "_file"
 """End of the names of options that are paths of files."""
 
+_NO_FILE = ("", "null")
 _TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 _YAML_WIDTH = 10_000
 _YAML_BOOL, _YAML_DATE = "tag:yaml.org,2002:bool", "tag:yaml.org,2002:timestamp"
-_YAML_MARKUP = ("[", "{", "'", '"', "!", "&", "*")
-"""First characters of a value on the command line that is more than unquoted text."""
 _YAML_SCALAR_END = "...\n"
 _HEADING = "# Defaults of all stages. `make configs` writes this file from the code; a test compares the two."
 
@@ -115,9 +114,9 @@ def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
 
 
 def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
-    """Convert `["mesh.max_faces=30000"]` to `{"mesh.max_faces": 30000}`; the values are YAML.
+    """Convert `["mesh.max_faces=30000"]` to `{"mesh.max_faces": "30000"}`; `build_config` reads values by their types.
 
-    Text needs no quotes, whatever characters are in it.
+    An empty value, or null, of an option that is the path of a file becomes None.
 
     Raises:
         UserError: an assignment does not have the form section.key=value.
@@ -128,7 +127,8 @@ def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
         parts = key.split(".")
         if not equals or len(parts) < 2 or not all(parts):
             raise UserError(f"--set {assignment} is not valid: write --set section.key=value")
-        overrides[key] = _parse_value(text.strip(), f"--set {assignment}")
+        value = text.strip()
+        overrides[key] = None if key.endswith(FILE_OPTION_SUFFIX) and value in _NO_FILE else value
     return overrides
 
 
@@ -143,11 +143,15 @@ def check_sections(layers: ConfigLayers, known: Iterable[str]) -> None:
 def build_config(section: str, config_type: type[ConfigType], layers: ConfigLayers) -> ConfigType:
     """Build the typed options of one section.
 
+    A text is the value of an option that is text; for other types it is read as YAML, and an empty list may be nothing.
+
     Raises:
         UserError: a key or value is not valid; the message names the key, the value, what is allowed, and the layer.
     """
     try:
-        return config_type.model_validate(layers.values.get(section) or {})
+        fields, values = config_type.model_fields, layers.values.get(section) or {}
+        types = {key: fields[key].annotation if key in fields else None for key in values}
+        return config_type.model_validate({key: _read_value(value, types[key]) for key, value in values.items()})
     except ValidationError as error:
         raise UserError(_format_validation_error(section, config_type, error.errors()[0], layers)) from None
 
@@ -178,15 +182,18 @@ def _read_sections(path: Path) -> dict[str, Any]:
     return {name: values or {} for name, values in sections.items()}
 
 
-def _parse_value(text: str, origin: str) -> Any:
-    """Parse the value of an assignment: what is neither quoted nor in brackets is one number, true, null or text."""
-    if text.startswith(_YAML_MARKUP):
-        return _parse_yaml(text, origin)
+def _read_value(value: Any, annotation: Any) -> Any:
+    """Return the value of an option of a type: text that is not YAML stays text, which the check of the type names."""
+    if isinstance(value, Mapping):
+        return {key: _read_value(item, None) for key, item in value.items()}
+    if not isinstance(value, str) or annotation is str or str in get_args(annotation):
+        return value
+    if not value and get_origin(annotation) is tuple:
+        return []
     try:
-        value = yaml.load(text, _Loader)  # noqa: S506 - a safe loader
-    except (yaml.YAMLError, ValueError):
-        return text
-    return text if isinstance(value, str | dict | list) else value
+        return yaml.load(value, _Loader)  # noqa: S506 - a safe loader
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return value
 
 
 def _parse_yaml(text: str, origin: str) -> Any:
@@ -261,7 +268,9 @@ def _format_validation_error(
 
 def _describe_constraints(info: FieldInfo, error: Mapping[str, Any]) -> str:
     """Describe the values that a field allows: type and limits; for other types, the message of pydantic."""
-    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most", "min_length": "of a length of at least"}
+    if error["type"] == "tuple_type":
+        return "a list, written as [a, b]"
     limits = [
         f"{word} {getattr(constraint, name)}"
         for constraint in info.metadata

@@ -243,7 +243,7 @@ def test_what_a_stage_refuses_is_not_recorded(toy: Toy, isolated: bool) -> None:
     assert refused.returncode == 2
     assert refused.stderr.splitlines()[-1] == "error: summarise.word = w1 is not a word: choose letters"
     record = json.loads((toy.run_dir / "run.json").read_text())
-    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"learn.steps": 7}}
+    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"learn.steps": "7"}}
     assert call().returncode == 0
 
 
@@ -269,7 +269,7 @@ def test_a_video_that_is_refused_is_not_recorded(toy: Toy) -> None:
 def test_options_of_a_killed_run_stay_recorded(toy: Toy) -> None:
     killed = toy.call_all("--video", "numbers.txt", "--set", "learn.steps=30", TOY_KILL_STEP="25")
     assert "killed by signal 9" in killed.stderr
-    assert read_overrides(toy.run_dir) == {"learn.steps": 30}
+    assert read_overrides(toy.run_dir) == {"learn.steps": "30"}
 
 
 def test_another_video_needs_force(toy: Toy) -> None:

@@ -29,6 +29,8 @@ class Options(Config):
     sides_m: tuple[float, float] = Field((1.0, 2.0), description="metres")
     words: tuple[Literal["fast", "fine"], ...] = Field((), description="a list")
     rate: float = Field(0.1, gt=0, le=1, description="learning rate, per step")
+    note: str | None = Field(None, description="a note")
+    author: str = Field("x", min_length=1, description="a person")
 
     @model_validator(mode="after")
     def _check_name(self) -> Self:
@@ -87,10 +89,18 @@ def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
         ("mesh.sides_m=[1]", ("mesh.sides_m = [1] is not allowed: it has too few values (metres)",)),
         ("mesh.sides_m=[1, 2, 3]", ("mesh.sides_m = [1, 2, 3] is not allowed", "at most 2")),
         ("mesh.words=[fast, slow]", ("mesh.words contains 'slow', which is not allowed: it must be 'fast' or 'fine'",)),
-        ("mesh.sizes=8", ("mesh.sizes is unknown", "did you mean size?", "size, kind, name, sides_m, words, rate")),
+        (
+            "mesh.sizes=8",
+            ("mesh.sizes is unknown", "did you mean size?", "size, kind, name, sides_m, words, rate, note"),
+        ),
         ("mesh.rat=8", ("mesh.rat is unknown", "did you mean rate?")),
         ("mesh.size.a=8", ("mesh.size = {'a': 8}", "a whole number")),
         ("mesh.size={a: 8}", ("mesh.size = {'a': 8}", "a whole number")),
+        ("mesh.size=[1", ("mesh.size = '[1'", "a whole number")),
+        ("mesh.sides_m=1, 2", ("mesh.sides_m = '1, 2'", "a list, written as [a, b] (metres)")),
+        ("mesh.sides_m=[1, 2", ("mesh.sides_m = '[1, 2'", "a list, written as [a, b] (metres)")),
+        ("mesh.sides_m=", ("mesh.sides_m = [] is not allowed: it has too few values (metres)",)),
+        ("mesh.author=", ("mesh.author = ''", "it must be text, of a length of at least 1 (a person)")),
     ],
 )
 def test_a_bad_value_is_one_sentence(config_dir: Path, assignment: str, words: tuple[str, ...]) -> None:
@@ -124,7 +134,7 @@ def test_a_broken_file_is_named(config_dir: Path, text: str) -> None:
         load_layers("broken", {}, config_dir)
 
 
-@pytest.mark.parametrize("assignment", ["mesh.size", "size=3", ".size=3", "mesh.=3", "mesh.size=[1"])
+@pytest.mark.parametrize("assignment", ["mesh.size", "size=3", ".size=3", "mesh.=3"])
 def test_a_broken_assignment_is_named(assignment: str) -> None:
     with pytest.raises(UserError, match="--set"):
         parse_overrides([assignment])
@@ -175,20 +185,32 @@ def test_default_yaml_reads_back_as_the_defaults() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["Shot #3, for the museum", "Only for X: ask", "@jane", "off", "2024-01-02", "- a", "%", "a: b: c", "x #"]
+    "text",
+    ["Shot #3, for the museum", "Only for X: ask", "@jane", "off", "2024-01-02", "- a", "%", "a: b: c", "x #", "#me"]
+    + ["", "007", "1.50", "2024", "true", "null", "~", "[draft] ask me", "[a, b]", "{", "&a", "!b", "'", '"a" and b'],
 )
-def test_text_needs_no_quotes(text: str) -> None:
-    assert parse_overrides([f"export.author={text}"]) == {"export.author": text}
-    assert parse_overrides([f"export.author='{text}'"]) == {"export.author": text}
+def test_text_is_taken_as_it_is(config_dir: Path, text: str) -> None:
+    assert built(config_dir, "default", f"mesh.note={text}").note == text
+    if text:
+        assert built(config_dir, "default", f"mesh.author={text}").author == text
 
 
-def test_text_of_digits_is_text(config_dir: Path) -> None:
-    assert built(config_dir, "default", "mesh.name=2024").name == "2024"
+@pytest.mark.parametrize(("text", "words"), [("", ()), ("[]", ()), ("[fast, fine]", ("fast", "fine"))])
+def test_a_list_may_be_empty(config_dir: Path, text: str, words: tuple[str, ...]) -> None:
+    assert built(config_dir, "default", f"mesh.words={text}").words == words
 
 
-@given(st.integers(-(10**6), 10**6))
-def test_overrides_keep_whole_numbers(number: int) -> None:
-    assert parse_overrides([f"a.b={number}"]) == {"a.b": number}
+@given(st.integers(16, 256))
+def test_numbers_are_read_by_the_type_of_the_option(number: int) -> None:
+    layers = ConfigLayers()
+    layers.add({"mesh": {"size": str(number), "rate": f"1e-{number % 9}"}}, "--set")
+    options = build_config("mesh", Options, layers)
+    assert (options.size, options.rate) == (number, float(f"1e-{number % 9}"))
+
+
+@pytest.mark.parametrize("text", ["", "null"])
+def test_the_path_of_a_file_can_be_removed(text: str) -> None:
+    assert parse_overrides([f"body.model_file={text}", f"body.x={text}"]) == {"body.model_file": None, "body.x": text}
 
 
 @pytest.mark.parametrize(
