@@ -59,8 +59,10 @@ SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
 SAMPLE_DONE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
-SET_OPTIONS = $(foreach item,$(SET),$(if $(findstring =,$(item)),--set $(item),$(error SET=$(SET): $(item) has no '='; a value with spaces goes through ARGS='--set "key=a value"')))
-RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(SET_OPTIONS)
+# An argument of the shell, whatever characters are in it.
+quoted = '$(subst ','\'',$(1))'
+SET_OPTIONS = $(foreach item,$(SET),$(if $(findstring =,$(item)),--set $(call quoted,$(item)),$(error SET=$(SET): $(item) has no '='; a value with spaces goes through ARGS='--set "key=a value"')))
+RUN_OPTIONS = $(if $(PRESET),--preset $(call quoted,$(PRESET))) $(SET_OPTIONS)
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
@@ -92,7 +94,7 @@ else
 	@test -x $(VENV)/bin/snakemake || { echo "error: Snakemake is not installed: make venv EXTRA=cluster" >&2; exit 2; }
 	$(VENV)/bin/snakemake --snakefile configs/cluster/Snakefile --profile configs/cluster/$(CLUSTER) \
 		$(if $(JOBS),--jobs $(JOBS)) $(ARGS) --config videos="$(VIDEOS)" runs="$(RUNS)" project="$(CURDIR)" \
-		python="$(CURDIR)/$(RUN_PYTHON)" options="$(RUN_OPTIONS)"
+		python="$(CURDIR)/$(RUN_PYTHON)" options=$(call quoted,$(RUN_OPTIONS))
 endif
 
 chart: $(STAMP)  ## plot accuracy against time of PRESETS on CAPTURES with SEEDS (default: all presets, two generated people)
@@ -160,7 +162,7 @@ bench: bench-field  ## bench-field, then the kernels alone; run nothing else at 
 	$(RUN_PYTHON) -m tests.bench.bench_kernels $(if $(JSON),--json "$(basename $(JSON))-kernels.json")
 
 bench-field: $(STAMP)  ## time each part of a training step: RUN=runs/name or a painted body; JSON=file
-	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run $(RUN)) $(if $(PRESET),--preset $(PRESET)) \
+	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run $(RUN)) $(if $(PRESET),--preset $(call quoted,$(PRESET))) \
 		$(if $(BASELINE),--baseline $(BASELINE)) $(if $(JSON),--json "$(JSON)") $(ARGS)
 
 bench-body: $(STAMP)  ## compare frames and body with the ground truth of synthetic CAPTURES

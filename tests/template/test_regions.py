@@ -1,8 +1,12 @@
 """Parts of the built-in body, and its outer surface."""
 
+from pathlib import Path
+
 import numpy as np
+import pytest
 import trimesh
 
+from data_tools import template_assets, template_layout
 from data_tools.template_assets import main
 from pipeline.body.body import load_anny
 from pipeline.geometry.surface import signed_distance_m
@@ -18,6 +22,17 @@ def test_the_parts_of_the_package_are_those_of_the_library(tmp_path) -> None:
         assert made.keys() == kept.keys()
         for key, array in made.items():
             np.testing.assert_array_equal(kept[key], array, err_msg=f"{name}: {key}", strict=True)
+
+
+@pytest.mark.parametrize("tool", [template_assets, template_layout])
+def test_help_is_shown_and_nothing_is_written(tool, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(f"{tool.__name__}.load_anny", lambda: pytest.fail("the model is not needed"))
+    with pytest.raises(SystemExit) as ended:
+        tool.main(["--help"])
+    assert ended.value.code == 0
+    assert f"usage: python -m {tool.__name__}" in capsys.readouterr().out
+    assert not list(Path.cwd().iterdir())
 
 
 def test_the_outer_surface_is_closed_and_solid_behind_lips_and_lids() -> None:
