@@ -8,7 +8,6 @@ without any alignment beside it.
 from collections import defaultdict
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -315,8 +314,8 @@ def _aligned_scores(avatar: Mesh, true: Mesh, alignment: SimilarityTransform) ->
 def _true_mask(comparison: Comparison, position: int) -> UInt8[np.ndarray, "h w"]:
     """Return the true coverage of a selected frame, 0 to 255, at the image size of the run."""
     capture = comparison.run.capture
-    mask = load_true_mask(comparison.folder.parent, int(capture.frame_index[position]))
-    return cv2.resize(mask, (capture.width, capture.height), interpolation=cv2.INTER_AREA)
+    frame_index = int(capture.frame_index[position])
+    return load_true_mask(comparison.folder.parent, frame_index, (capture.width, capture.height))
 
 
 def render_under_light(comparison: Comparison, surface: Mesh, camera: Camera) -> Float[np.ndarray, "h w 4"]:

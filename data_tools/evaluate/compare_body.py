@@ -32,14 +32,13 @@ SURFACE_FRAMES = 8
 
 
 def compare_masks(out: Path, frames: Path) -> dict[str, float]:
-    """Return median and minimum over frames of the IoU of the frames stage's masks and the true masks."""
-    scores = [
-        mask_iou(
-            foreground_mask(read_gray(frames / "masks" / f"{index:06d}.png")),
-            foreground_mask(load_true_mask(out, index)),
-        )
-        for index in load_npz(frames / "frames.npz")["frame_index"].tolist()
-    ]
+    """Return median and minimum over frames of the IoU of the frames stage's masks and the true masks of their size."""
+    scores = []
+    for index in load_npz(frames / "frames.npz")["frame_index"].tolist():
+        mask = read_gray(frames / "masks" / f"{index:06d}.png")
+        height, width = mask.shape
+        true_mask = load_true_mask(out, index, (width, height))
+        scores.append(mask_iou(foreground_mask(mask), foreground_mask(true_mask)))
     return {"mask_iou_median": float(np.median(scores)), "mask_iou_worst": float(np.min(scores))}
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -127,9 +128,13 @@ def _damaged_settings_error(out: Path) -> UserError:
     )
 
 
-def load_true_mask(out: Path, frame_index: int) -> UInt8[np.ndarray, "h w"]:
-    """Read the coverage by the person, 0 to 255, in one frame of a camera that stands still."""
-    return read_gray(out / "truth" / "masks" / f"{frame_index:06d}.png")
+def load_true_mask(out: Path, frame_index: int, size_px: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w"]:
+    """Read the coverage by the person, 0 to 255, in one frame of a camera that stands still.
+
+    size_px: width and height of the result, such as those of a run's frames; None: those of the capture.
+    """
+    mask = read_gray(out / "truth" / "masks" / f"{frame_index:06d}.png")
+    return mask if size_px is None else cv2.resize(mask, size_px, interpolation=cv2.INTER_AREA)
 
 
 def verify_ground_truth(out: Path, frame_stride: int = 1) -> GroundTruthCheck:

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -27,7 +28,7 @@ from pipeline.body.files import load_body, load_camera, load_motion, save_body, 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST_FILE, Manifest, digest_video, write_manifest
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
-from pipeline.io.image import write_gray
+from pipeline.io.image import read_gray, write_gray
 from pipeline.io.npz import save_npz
 
 
@@ -129,6 +130,13 @@ def test_iou_of_a_cropped_mask(sample: Path, run: Path) -> None:
     figures = compare_masks(sample, run / "frames")
     assert figures["mask_iou_worst"] == pytest.approx((half > 127).sum() / (mask > 127).sum())
     assert figures["mask_iou_median"] == 1.0
+
+
+def test_masks_of_reduced_frames_are_compared_at_their_size(sample: Path, run: Path) -> None:
+    """As a preset with frames.max_side_px below the size of the capture stores them."""
+    for path in (run / "frames" / "masks").iterdir():
+        write_gray(path, cv2.resize(read_gray(path), (120, 120), interpolation=cv2.INTER_AREA))
+    assert compare_masks(sample, run / "frames") == {"mask_iou_median": 1.0, "mask_iou_worst": 1.0}
 
 
 def test_surface_distance_of_the_true_body_ignores_translation(sample: Path, run: Path) -> None:

@@ -285,12 +285,12 @@ def test_frame_with_an_empty_true_mask_is_left_out_with_a_warning(
     two = replace(perfect, run=replace(perfect.run, capture=replace(perfect.run.capture, split=split)))
     nothing = np.zeros((perfect.run.camera.height, perfect.run.camera.width, 4), np.float32)
     monkeypatch.setattr(compare_avatar, "render_upper_bound", lambda comparison, positions: [nothing] * len(positions))
-    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, frame: (frame > 0) * load_true_mask(out, frame))
+    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, k, size: (k > 0) * load_true_mask(out, k, size))
     take_warnings()
     assert compare_heldout_images(two)["mesh_true_mask"]["mask_iou"] > 0.98
     (warning,) = take_warnings()
     assert "held-out frame 0 is not scored" in warning
-    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, frame: 0 * load_true_mask(out, frame))
+    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, k, size: 0 * load_true_mask(out, k, size))
     with pytest.raises(UserError, match="no held-out frame can be scored"):
         compare_heldout_images(two)
 
