@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> None:
     if not finished:
         command = format_command("--run", options.run, "--video", options.out / "video")
         raise UserError(f"{options.run} has no finished stage; run {command}")
-    _require_video_of(options.out, options.run)
+    require_video_of(options.out, options.run)
     require_matching_stages(options.run, STAGES if "report" in finished else finished)
     sections: dict[str, Any] = {}
     if "frames" in finished:
@@ -57,7 +57,7 @@ def main(argv: Sequence[str]) -> None:
         print(f"light: {sections['light']}")
 
 
-def _require_video_of(out: Path, run: Path) -> None:
+def require_video_of(out: Path, run: Path) -> None:
     """Raise UserError if a run was made from another recording than that of the capture in `out`, wherever it lies.
 
     The run may have read the video file, or a folder with the file alone or with what is in its folder now.

@@ -17,6 +17,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from data_tools.command import run_command
+from data_tools.evaluate.compare import require_video_of
+from data_tools.evaluate.truth import read_capture_settings, require_current_version
 from data_tools.sweep.field_rows import GROUPS, REFERENCE, ROWS, SIZE, rows_of_group
 from data_tools.sweep.field_tables import write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
@@ -34,13 +36,17 @@ def main(argv: Sequence[str]) -> None:
     """Run what is missing, then write the tables.
 
     Raises:
-        UserError: a run or its capture does not exist, or a training failed.
+        UserError: a run or its capture does not exist, they do not belong together, or a training failed.
     """
     options = _parse(argv)
     for run in options.runs:
-        for folder in (run / "frames", run / "body", *([_capture(run) / "truth"] if options.truth else [])):
+        for folder in (run / "frames", run / "body"):
             if not folder.is_dir():
                 raise UserError(f"{folder} does not exist: name runs whose body stage is finished")
+        if options.truth:
+            capture = _capture(run)
+            require_current_version(capture, read_capture_settings(capture))
+            require_video_of(capture, run)
     names = options.rows or rows_of_group(options.group)
     names.sort(key=lambda name: name != REFERENCE)
     trials = [_trial(run, name, seed, options) for seed, name, run in product(options.seeds, names, options.runs)]

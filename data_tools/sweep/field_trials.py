@@ -12,7 +12,7 @@ from data_tools.evaluate.field_truth import score_field
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.field_rows import FieldRow
 from pipeline.core.atomic import atomic_path
-from pipeline.core.manifest import digest_json, outputs_digests
+from pipeline.core.manifest import digest_json, digest_video, outputs_digests
 from pipeline.core.measure import describe_environment
 from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
@@ -54,9 +54,10 @@ class FieldTrial:
 
     @property
     def identity(self) -> str:
-        """Digest of what the scores depend on, besides the code: options, frames and body."""
+        """Digest of what the scores depend on, besides the code: options, frames, body and truth."""
         config, inputs = self.config.model_dump(mode="json"), outputs_digests(self.run, INPUTS)
-        return digest_json({"config": config, "truth": self.truth is not None, "inputs": inputs})
+        truth = None if self.truth is None else digest_video(self.truth / "truth")
+        return digest_json({"config": config, "truth": truth, "inputs": inputs})
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def run_trial(trial: FieldTrial) -> TrialScores:
 
 
 def begin_folder(trial: FieldTrial) -> None:
-    """Make the folder of a trial; what was made there of other options, frames or body is removed."""
+    """Make the folder of a trial; what was made there of another identity is removed."""
     mark = trial.folder / IDENTITY_FILE
     if trial.folder.exists() and not (mark.is_file() and mark.read_text(encoding="utf-8") == trial.identity):
         shutil.rmtree(trial.folder)
@@ -106,7 +107,7 @@ def begin_folder(trial: FieldTrial) -> None:
 
 
 def read_trial(trial: FieldTrial) -> TrialScores | None:
-    """Return the scores of a trial; None if it is not finished, or was made of other options, frames or body."""
+    """Return the scores of a trial; None if it is not finished, or was made of another identity."""
     path = trial.folder / SCORES_FILE
     if not path.is_file():
         return None

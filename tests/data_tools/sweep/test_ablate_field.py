@@ -1,7 +1,7 @@
 """The sweep of the field stage: its rows, its resumption, and its tables, on trainings whose scores are known."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +10,7 @@ from data_tools.sweep import ablate_field, field_trials
 from data_tools.sweep.field_rows import ATTENTION, GROUPS, REFERENCE, ROWS, rows_of_group
 from data_tools.sweep.field_tables import COLUMNS, format_difference, paired_scores, write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, begin_folder, read_trial, run_trial
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST_FILE, Manifest, write_manifest
 from pipeline.field.checkpoint import CHECKPOINT_FILE
@@ -82,6 +83,40 @@ def test_scores_and_checkpoints_of_other_frames_are_not_used(tmp_path: Path, mon
     (of_person["ann"].folder / CHECKPOINT_FILE).touch()
     assert "cpu_seconds" in run_trial(of_person["bob"]).scores  # not resumed
     assert not (of_person["bob"].folder / CHECKPOINT_FILE).exists()
+
+
+def test_scores_against_another_truth_are_not_used(tmp_path: Path, monkeypatch):
+    """A capture may be made again with other options."""
+    monkeypatch.setattr(field_trials.field, "run", lambda inputs, out, config: {"validation_psnr_db": 30.0})
+    monkeypatch.setattr(field_trials, "score_field", lambda run, folder, capture: {"haze": 0.1})
+    settings = tmp_path / "one-capture" / "truth" / "capture_settings.json"
+    settings.parent.mkdir(parents=True)
+    settings.write_text('{"seed": 0}')
+    judged = replace(trial(tmp_path / "out", REFERENCE), truth=tmp_path / "one-capture")
+    assert run_trial(judged) == read_trial(judged)
+    settings.write_text('{"seed": 1}')
+    assert read_trial(judged) is None
+
+
+def test_a_capture_of_another_video_is_refused(tmp_path: Path, monkeypatch):
+    run, capture = tmp_path / "one", tmp_path / "one-capture"
+    for folder in (run / "frames", run / "body", capture / "truth", capture / "video"):
+        folder.mkdir(parents=True)
+    (capture / "video" / "video.mp4").write_text("the video of someone else")
+    settings = capture / "truth" / "capture_settings.json"
+    settings.write_text(json.dumps({"version": CAPTURE_VERSION}))
+    manifest = Manifest("frames", 1, "", {}, {"video": "the digest of mine"}, {}, {}, 0.0, 0.0)
+    write_manifest(manifest, run / "frames" / MANIFEST_FILE)
+    monkeypatch.setattr(ablate_field, "run_trial", lambda trial: pytest.fail("a field was trained"))
+    command = [str(run), "--rows", REFERENCE, "--truth", "--out", str(tmp_path / "out")]
+    with pytest.raises(UserError, match=r"one was not made from .*video\.mp4 as it is now"):
+        ablate_field.main(command)
+    settings.write_text(json.dumps({"version": 1}))
+    with pytest.raises(UserError, match="one-capture is a capture of version 1"):
+        ablate_field.main(command)
+    settings.unlink()
+    with pytest.raises(UserError, match="holds no ground truth"):
+        ablate_field.main(command)
 
 
 def test_an_interrupted_training_has_no_seconds(tmp_path: Path, monkeypatch):
