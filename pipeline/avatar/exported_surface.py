@@ -78,8 +78,10 @@ class ExportedSurface:
         place = np.stack([texels.columns + 0.5, FACE_COVERAGE_PX - texels.rows - 0.5], axis=1) / FACE_COVERAGE_PX
         boxes = [np.reshape(CHART_BOXES[part], (2, 2)) for part in (SKIN, EYE_LEFT, EYE_RIGHT)]
         texels = texels.select(np.any([((place >= low) & (place <= high)).all(axis=1) for low, high in boxes], axis=0))
+        captured = Mesh(avatar.vertices.numpy(), avatar.faces.numpy())
         points = texels.interpolate(faces, self.mesh.vertices)
-        _, face, barycentric = closest_points_on_mesh(points, Mesh(avatar.vertices.numpy(), avatar.faces.numpy()))
+        points[:, 1] += captured.vertices[:, 1].min() - self.mesh.vertices[:, 1].min()  # files stand on their soles
+        _, face, barycentric = closest_points_on_mesh(points, captured)
         uv = np.einsum("nk,nkc->nc", barycentric, avatar.uv.numpy()[avatar.faces_uv.numpy()[face]])
         side_px = len(coverage)
         columns, rows = np.clip((np.stack([uv[:, 0], 1.0 - uv[:, 1]]) * side_px).astype(int), 0, side_px - 1)

@@ -50,11 +50,14 @@ def square(left: float, bottom: float, side: float, z_m: float) -> tuple[np.ndar
 
 
 def test_coverage_of_a_moving_face_has_the_layout_of_the_file() -> None:
-    """A captured square of one metre, of which the video shows the left half; three parts of a face lie before it."""
+    """A captured square of one metre, of which the video shows a part on the left; three parts of a face lie before it.
+
+    The exported one stands higher, as files do whose soles are at y = 0.
+    """
     captured_m, faces = square(0.0, 0.0, 1.0, 0.0)
     own_uv = 0.1 + 0.8 * captured_m[:, :2]
     coverage = np.zeros((256, 256), np.uint8)
-    coverage[20:236, 20:128] = 200
+    coverage[100:156, 20:128] = 200
     avatar = TexturedAvatar(
         *(torch.from_numpy(array) for array in (captured_m, faces)),
         torch.zeros((4, 4), dtype=torch.int64),
@@ -70,7 +73,7 @@ def test_coverage_of_a_moving_face_has_the_layout_of_the_file() -> None:
         box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
         parts.append((corners_m, 0.5 * box * [1.0, 2.0] + [0.5, 0.0]))
     vertices, uv = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))
-    joined = Mesh(vertices, np.concatenate([faces + 4 * k for k in range(4)]))
+    joined = Mesh(vertices + np.float32([0.0, 0.3, 0.0]), np.concatenate([faces + 4 * k for k in range(4)]))
     wide = ExportedSurface(joined, joined.vertex_normals(), uv, np.zeros((256, 512, 3), np.uint8))
     found = wide.coverage_map(avatar, coverage)
     assert found.shape == (256, 512)
