@@ -98,7 +98,7 @@ def test_rows_share_the_stages_before_the_mesh(base: Trial) -> None:
     for name in ("frames", "body", "field"):
         assert (trial.run_dir / name).resolve() == (base.run_dir / name).resolve()
         assert not (trial.run_dir / name).readlink().is_absolute()
-    assert read_record(trial.run_dir).overrides == {"field.seed": 2, "mesh.rounds": 0}
+    assert read_record(trial.run_dir).overrides == {"field.seed": "2", "mesh.rounds": 0}
     assert plan_run_stage(trial.run_dir, "mesh").config.model_dump()["rounds"] == 0
 
 
