@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from data_tools.command import run_command
 from data_tools.folder import result_folder
-from data_tools.pose import check_folder_name, export_config, play_bvh
+from data_tools.pose import EXPORTED_CLIPS, check_folder_name, export_config, play_bvh
 from data_tools.synthetic.scene.movie import FOR_PLAYERS, write_video
 from pipeline.avatar.film import FPS, render_film, turntable_motion
 from pipeline.avatar.finished_run import load_textured_avatar
@@ -30,7 +30,7 @@ from stages import export
 from stages.export import Scene, load_scene
 
 TURNTABLE = "turntable"
-CLIPS = (TURNTABLE, "capture", "idle")
+CLIPS = (TURNTABLE, *EXPORTED_CLIPS)
 """What every avatar can be filmed with."""
 MIN_FRAMES = 2
 

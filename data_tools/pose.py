@@ -40,6 +40,9 @@ from stages.export import Scene, encode_scene, load_scene, write_scene_obj
 
 RIG_POSES = ("a", "t")
 
+EXPORTED_CLIPS = ("capture", "idle")
+"""The clips of every avatar."""
+
 
 def main(argv: Sequence[str]) -> None:
     """Write the clips and poses of one command."""
@@ -171,7 +174,7 @@ def _check_clips(options: argparse.Namespace) -> None:
     names = [path.stem for path in options.bvh]
     for path, name in zip(options.bvh, names, strict=True):
         require_bvh_file(path)
-        if name in ("capture", "idle"):
+        if name in EXPORTED_CLIPS:
             raise UserError(f"{name} is the name of a clip that every avatar has; rename the file {path}")
         if names.count(name) > 1:
             raise UserError(f"there are several clips with the name {name}; rename the file {path}")

@@ -40,8 +40,8 @@ def main(argv: Sequence[str]) -> None:
     if options.diffuse is not None and options.mask is not None:
         raise UserError("--mask is for the texture of another run; with --diffuse, paint alpha instead")
     image = options.mask or options.diffuse
-    name = image.stem if image else options.other.resolve().name
-    name = check_folder_name(options.name) if options.name else name
+    default_name = image.stem if image else options.other.resolve().name
+    name = check_folder_name(options.name) if options.name else default_name
     if options.diffuse is not None:
         painting = read_painting(options.diffuse)
         avatar = load_editable_avatar(options.run)

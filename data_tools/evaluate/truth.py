@@ -68,9 +68,12 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         light = Light(**{name: _tuple_of(value) for name, value in settings["light"].items()})
         fps, samples = float(settings["fps"]), int(settings["samples"])
         hand_held_deg = float(settings["hand_held_deg"])
+        is_furnished, seed = settings["background"] == "busy", int(settings["seed"])
     except (KeyError, TypeError, ValueError):
         raise _damaged_settings_error(out) from None
     subject = load_subject(truth)
+    is_carried = settings.get("walk_around", False)
+    surroundings = make_surroundings(camera, ground_m, is_furnished, ValueNoise(seed)) if is_carried else None
     return SyntheticCapture(
         subject=subject,
         motion=load_motion(truth / "motion.npz"),
@@ -82,9 +85,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         samples=samples,
         ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
         hand_held_deg=hand_held_deg,
-        surroundings=make_surroundings(camera, ground_m, settings["background"] == "busy", ValueNoise(settings["seed"]))
-        if settings.get("walk_around")
-        else None,
+        surroundings=surroundings,
     )
 
 

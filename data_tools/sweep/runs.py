@@ -16,7 +16,7 @@ from data_tools.evaluate.files import load_comparison_scores
 from pipeline.core.atomic import atomic_path
 from pipeline.core.config import parse_overrides
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import Manifest, read_manifest
+from pipeline.core.manifest import Manifest, read_manifests
 from pipeline.core.parent import die_with_parent_environment
 from pipeline.core.record import RunRecord, read_record
 from pipeline.core.run_folder import RunRequest
@@ -82,8 +82,7 @@ def read_run(run_dir: Path, record: RunRecord | None = None, request: RunRequest
         states = _states(run_dir, record, request)
     except (UserError, OSError) as error:
         states, failure = dict.fromkeys(stages.STAGES, "missing"), str(error)
-    found = {name: read_manifest(run_dir / name) for name, state in states.items() if state == FRESH}
-    manifests = {name: manifest for name, manifest in found.items() if manifest}
+    manifests = read_manifests(run_dir, [name for name, state in states.items() if state == FRESH])
     is_done = len(manifests) == len(states)
     return RunState(states, manifests, read_scores(run_dir) if is_done else {}, failure)
 

@@ -67,6 +67,12 @@ def read_manifest(folder: Path) -> Manifest | None:
         raise UserError(f"{path} is damaged or from another version: delete {folder} and run the stage again") from None
 
 
+def read_manifests(run_dir: Path, stages: Iterable[str]) -> dict[str, Manifest]:
+    """Return the manifests of the finished ones of these stages of a run, by name. UserError if one is damaged."""
+    found = {name: read_manifest(run_dir / name) for name in stages}
+    return {name: manifest for name, manifest in found.items() if manifest}
+
+
 def finished_stages(run_dir: Path) -> dict[str, Manifest]:
     """Return the manifests of a run's finished stages by name: of the folders whose manifest names them as a stage.
 
@@ -76,8 +82,7 @@ def finished_stages(run_dir: Path) -> dict[str, Manifest]:
         UserError: a manifest is damaged.
     """
     names = sorted(path.name for path in run_dir.iterdir() if _holds_stage(path)) if run_dir.is_dir() else []
-    manifests = {name: read_manifest(run_dir / name) for name in names}
-    return {name: manifest for name, manifest in manifests.items() if manifest}
+    return read_manifests(run_dir, names)
 
 
 def outputs_digests(run_dir: Path, stages: Iterable[str]) -> dict[str, str | None]:
@@ -94,8 +99,7 @@ def require_matching_stages(run_dir: Path, stages: Iterable[str]) -> None:
     Raises:
         UserError: one was made from another result of one of the others than the run holds now.
     """
-    found = {name: read_manifest(run_dir / name) for name in stages}
-    manifests = {name: manifest for name, manifest in found.items() if manifest}
+    manifests = read_manifests(run_dir, stages)
     for name, manifest in manifests.items():
         for need, digest in manifest.inputs.items():
             if need in manifests and manifests[need].outputs_digest != digest:

@@ -190,6 +190,8 @@ def mesh_psnr_db(mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView], 
 @torch.no_grad()
 def silhouette_iou(mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView]) -> float:
     """Return the intersection over union of rendered silhouettes and masks of all views, in [0, 1]; NaN without any."""
+    if not views:
+        return float("nan")
     intersection_px = union_px = 0
     vertices = torch.from_numpy(mesh.vertices)
     for view in views:
@@ -198,6 +200,4 @@ def silhouette_iou(mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView]
         mask = view.mask > 127
         intersection_px += int((covered & mask).sum())
         union_px += int((covered | mask).sum())
-    if not views:
-        return float("nan")
     return intersection_px / union_px if union_px else 0.0

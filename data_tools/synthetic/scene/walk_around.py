@@ -53,13 +53,13 @@ class Surroundings:
     walls: Float[np.ndarray, "4 h w 3"]
     floor: Float[np.ndarray, "w w 3"]
 
-    def seen_by(self, camera: Camera, ground_m: Float[np.ndarray, "3"], heading_rad: float) -> Room:
-        """Render the empty room, turned by the heading about the vertical through `ground_m`."""
+    def seen_by(self, camera: Camera, ground_m: Float[np.ndarray, "3"], turn_rad: float) -> Room:
+        """Render the empty room, turned by this angle about the vertical through `ground_m`."""
         fine = camera.scaled(float(_SAMPLES_PER_AXIS))
         y, x = np.mgrid[: fine.height, : fine.width] + 0.5
         pixels = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)).float()
         origins, directions = (rays.numpy().astype(np.float64) for rays in pixel_rays(fine, pixels))
-        to_room = _rotation_about_y(-heading_rad).T
+        to_room = _rotation_about_y(-turn_rad).T
         colours = self._colours((origins - ground_m) @ to_room, directions @ to_room)
         shape = (camera.height, _SAMPLES_PER_AXIS, camera.width, _SAMPLES_PER_AXIS, 3)
         return Room(colours.reshape(shape).mean(axis=(1, 3)), floor_points(camera, ground_m))
@@ -105,9 +105,9 @@ def make_surroundings(
     return Surroundings(half_side_m, *(np.clip(part, 0.0, 1.0).astype(np.float32) for part in (np.stack(walls), floor)))
 
 
-def turned_light(light: Light, heading_rad: float) -> Light:
+def turned_light(light: Light, turn_rad: float) -> Light:
     """Return the light that turns with the room."""
-    x, y, z = _rotation_about_y(heading_rad) @ light.key_direction
+    x, y, z = _rotation_about_y(turn_rad) @ light.key_direction
     return replace(light, key_direction=(float(x), float(y), float(z)))
 
 

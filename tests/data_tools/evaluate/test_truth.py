@@ -75,6 +75,16 @@ def test_damaged_capture_settings_are_reported(text: str, sample: Path, tmp_path
         load_ground_truth(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["background", "hand_held_deg", "seed"])
+def test_settings_that_lack_an_option_are_damaged(name: str, sample: Path, tmp_path: Path) -> None:
+    shutil.copytree(sample / "truth", tmp_path / "truth")
+    path = tmp_path / "truth" / "capture_settings.json"
+    settings = json.loads(path.read_text()) | {"walk_around": True}
+    path.write_text(json.dumps({key: value for key, value in settings.items() if key != name}))
+    with pytest.raises(UserError, match=r"capture_settings\.json is damaged"):
+        load_ground_truth(tmp_path)
+
+
 def test_a_capture_of_another_version_names_the_command(sample: Path, tmp_path: Path) -> None:
     shutil.copytree(sample / "truth", tmp_path / "truth")
     path = tmp_path / "truth" / "capture_settings.json"
