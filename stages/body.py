@@ -59,7 +59,7 @@ from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_rgb
 
-_BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
+_BODY, _BARE, _MOTION, _CAMERA, _OVERLAY = "body.npz", "bare.npz", "motion.npz", "camera.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
 
 
@@ -100,7 +100,7 @@ class Config(BaseConfig):
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: FitSettings = DEFAULT_SETTINGS
 ) -> Mapping[str, float]:
-    """Fit the body; write body, motion, camera, scores of the frames and the overlay image.
+    """Fit the body; write it with and without clothes, motion, camera, scores of the frames and the overlay image.
 
     settings: for sweeps and ablations from Python; the command uses the defaults.
 
@@ -116,11 +116,12 @@ def run(
     legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
     legs_as_filmed = legs.cloth_hangs_between_legs()
     if legs_as_filmed:
-        rest = rest_with_filmed_legs(result.body, motion, training & usable)
+        rest, bare = (rest_with_filmed_legs(body, motion, training & usable) for body in (result.body, result.bare))
         motion = rest.motion
-        result = replace(result, body=rest.body, rotations_wxyz=motion.rotations_wxyz)
+        result = replace(result, body=rest.body, bare=bare.body, rotations_wxyz=motion.rotations_wxyz)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
+    save_body(out / _BARE, result.bare)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
     blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
@@ -323,9 +324,9 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=34,
+    version=35,
     needs=("frames",),
-    makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
+    makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,
     run=run,
 )

@@ -1,12 +1,12 @@
 """mesh: a watertight, manifold mesh of the canonical field, refined on the video frames; poses fitted through it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
@@ -28,7 +28,7 @@ from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.geometry.surface import resolve_self_intersections
+from pipeline.geometry.surface import OpenSurfaceError, resolve_self_intersections
 from pipeline.io.image import write_rgb
 from pipeline.kernels.common.determinism import deterministic_sums
 from pipeline.kernels.common.heap import trim_heap
@@ -51,7 +51,7 @@ from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonic
 from pipeline.mesh.outline_alignment import align_outlines
 from pipeline.mesh.pose_alignment import MAX_PERSON_PX, AlignedSurface
 from pipeline.mesh.pose_selection import in_other_poses, is_far_from, merge_poses, score_motion
-from pipeline.mesh.refinement import refine_mesh, with_offsets
+from pipeline.mesh.refinement import RefinementState, refine_mesh, with_offsets
 from pipeline.mesh.remeshing import faces_by_part, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_relaxation import move_along, relax_skin
@@ -61,6 +61,7 @@ from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhou
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.template.face.filmed_head import move_face_to_frames
 from pipeline.template.face.filmed_landmarks import FilmedFaces
+from pipeline.template.hollow_skirt import cut_out, find_cavity, hollow_skin, vertices_inside
 from pipeline.template.regions import outer_surface
 
 CHECKPOINT = "checkpoint_round.safetensors"
@@ -68,6 +69,8 @@ DEFAULT_SETTINGS = MeshSettings()
 MOTIONS = ("interpolated", "aligned")
 EVIDENCE_FRAMES = 40
 """Training frames that tell how well the surface is seen."""
+MAX_INSIDE_SHARE = 0.2
+"""Share of the faces that the inside of a skirt may have: nothing shows its details."""
 JUDGED_FRAMES = 12
 """Validation frames that decide; without any, training frames on which the reduction of faces is judged."""
 
@@ -164,12 +167,12 @@ def run(
     if state.pose_offsets:
         motion = state.pose_offsets.of(body, motion.select(chosen[0])).apply(motion)
     shader, psnr_db = aligned.shader, state.validation_psnr_db
-    mesh = finish_mesh(state.mesh, aligned, config.max_final_faces)
-    unrelaxed_skin = state.skin if mesh is state.mesh else transfer_skin(mesh, body)
-    relaxed = relax_skin(mesh, unrelaxed_skin, body, aligned.train)
-    save_dense_mesh(out, move_along(state.mesh, mesh, relaxed.mesh))
+    bare = load_body(inputs["body"] / "bare.npz")
+    finished = finish_mesh(state, aligned, bare, config.max_final_faces)
+    relaxed = relax_skin(finished.mesh, finished.skin, body, aligned.train)
+    save_dense_mesh(out, move_along(finished.dense, finished.mesh, relaxed.mesh))
     mesh, skin = relaxed.mesh, relaxed.skin
-    write_results(out, mesh, skin, shader)
+    write_results(out, mesh, skin, shader, finished.is_inside)
     final_motion, motion_metrics = align_other_frames(
         capture, inputs, (body, motion), (mesh, skin, shader), aligned.validation
     )
@@ -208,18 +211,57 @@ def starting_mesh(
     return remesh_to_edge_length(extracted, inputs.target_edge_m, body)
 
 
-def finish_mesh(mesh: Mesh, inputs: RefinementInputs, face_limit: int) -> Mesh:
-    """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it.
+@dataclass(frozen=True)
+class FinishedMesh:
+    """The mesh with few faces and a hollow skirt, if the person wears one.
 
-    face_limit: see `reduce_faces`.
+    mesh, skin: of the export. dense: before the reduction of its faces. is_inside: vertices of the mesh inside of a
+    skirt or coat; None without one.
     """
+
+    mesh: Mesh
+    skin: SkinnedTopology
+    dense: Mesh
+    is_inside: Bool[np.ndarray, "v"] | None = None
+
+
+def finish_mesh(state: RefinementState, inputs: RefinementInputs, bare: Body, face_limit: int) -> FinishedMesh:
+    """Reduce the faces of the refined mesh, untangle it, and make its skirt hollow.
+
+    bare: the body below the clothes. face_limit: see `reduce_faces`.
+    """
+    try:
+        cavity = find_cavity(
+            state.mesh,
+            state.skin.weights.numpy(),
+            inputs.body,
+            bare,
+            inputs.target_edge_m,
+            int(MAX_INSIDE_SHARE * face_limit),
+        )
+        if cavity is not None:
+            dense = cut_out(state.mesh, cavity)
+            solid, skin = reduce_refined_mesh(state, inputs, face_limit - len(cavity.faces))
+            mesh = cut_out(solid, cavity, face_limit)
+            is_inside = vertices_inside(mesh, cavity)
+            return FinishedMesh(mesh, hollow_skin(mesh, solid, skin, inputs.body, is_inside), dense, is_inside)
+    except OpenSurfaceError as error:
+        warn(f"{error}; the inside of the skirt stays closed")
+    return FinishedMesh(*reduce_refined_mesh(state, inputs, face_limit), state.mesh)
+
+
+def reduce_refined_mesh(
+    state: RefinementState, inputs: RefinementInputs, face_limit: int
+) -> tuple[Mesh, SkinnedTopology]:
+    """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it."""
     views = inputs.validation or [inputs.train[k] for k in evenly_spaced(len(inputs.train), JUDGED_FRAMES)]
 
     def psnr_db(trial: Mesh) -> float:
         return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
 
-    parts = faces_by_part(mesh, inputs.body)
-    return resolve_self_intersections(reduce_faces(mesh, parts, psnr_db, inputs.settings, face_limit))
+    parts = faces_by_part(state.mesh, inputs.body)
+    mesh = resolve_self_intersections(reduce_faces(state.mesh, parts, psnr_db, inputs.settings, face_limit))
+    return mesh, state.skin if mesh is state.mesh else transfer_skin(mesh, inputs.body)
 
 
 def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config) -> float:
@@ -325,17 +367,22 @@ def align_other_frames(
     }
 
 
-def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn.Module) -> None:
-    """Write the mesh with its skin and vertex colours, and the turntable preview."""
+def write_results(
+    out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn.Module, is_inside: Bool[np.ndarray, "v"] | None
+) -> None:
+    """Write the mesh with its skin and vertex colours, and the turntable preview.
+
+    is_inside: vertices inside of a skirt or coat; None without one.
+    """
     with torch.no_grad():
         vertex_colours = shader(torch.from_numpy(mesh.vertices)).numpy()
-    save_mesh(out, MeshArtifact(mesh, *top_k_weights(skin.weights.numpy()), vertex_colours))
+    save_mesh(out, MeshArtifact(mesh, *top_k_weights(skin.weights.numpy()), vertex_colours, is_inside=is_inside))
     write_rgb(out / "preview.png", turntable_sheet(mesh, shader))
 
 
 STAGE = Stage(
     "mesh",
-    version=42,
+    version=43,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

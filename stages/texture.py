@@ -34,6 +34,7 @@ from pipeline.template.correspondence import correspond
 from pipeline.template.face.filmed_landmarks import FilmedFaces
 from pipeline.template.face.head_texture import register_person
 from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
+from pipeline.template.hollow_skirt import find_lining
 from pipeline.template.mirror import add_mirrored_colours, mirror_vertices
 from pipeline.template.registration import Registration
 from pipeline.template.template_atlas import TemplateAtlas, build_template_atlas
@@ -63,7 +64,7 @@ from pipeline.texture.light import VideoLight
 from pipeline.texture.lighting.shading import find_light, fit_highlights, light_metrics, light_views
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
-from pipeline.texture.unseen_sides import BodySlices, add_slice_colours
+from pipeline.texture.unseen_sides import BodySlices, add_slice_colours, add_unseen_colours
 from pipeline.texture.vertex_texels import vertex_map, vertex_surface
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
@@ -260,7 +261,8 @@ def build_atlas(
     if config.atlas == "template" and registration is None:
         warn("texture.atlas=template needs the built-in body, not one of a model file: the layout is the person's own")
     if config.atlas == "template" and registration is not None:
-        on_template = build_template_atlas(skinned.mesh, registration, size_px, settings.padding_px)
+        layout = registration, size_px, settings.padding_px
+        on_template = build_template_atlas(skinned.mesh, *layout, is_inside=skinned.is_inside)
         return on_template.atlas, size_px, on_template
     part = body_part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)
     return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px, None
@@ -285,18 +287,22 @@ def make_texel_inpainter(
     """Return a function that inpaints unobserved texels from observed colours.
 
     From those of the other side of the body where both sides agree, of the same slice of the body part far from
-    everything that is observed, and around them on the surface elsewhere.
+    everything that is observed, of the outer side for the lining of a skirt, and around them on the surface elsewhere.
 
     template: tells the other side of the body.
     """
     mesh, partner = skinned.mesh, None
+    is_inside = np.zeros(len(mesh.vertices), dtype=bool) if skinned.is_inside is None else skinned.is_inside
+    lining = find_lining(mesh, is_inside)
     slices = BodySlices.of_vertices(mesh.vertices, skinned.joint_indices, skinned.joint_weights, body)
+    slices = slices.without(is_inside)
     if template is not None:
         partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
         means, weights = add_slice_colours(mesh.vertices, slices, means, weights)
+        means, weights = add_unseen_colours(lining.vertices, lining.of_outer_side(means), means, weights)
         if partner is not None:
             means, weights = add_mirrored_colours(mesh, partner, means, weights)
         return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
@@ -306,7 +312,7 @@ def make_texel_inpainter(
 
 STAGE = Stage(
     "texture",
-    version=18,
+    version=19,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

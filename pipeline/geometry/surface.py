@@ -1,7 +1,5 @@
 """Operations on closed surfaces: isosurface, repair, remeshing, subdivision, smoothing, closest points, distances."""
 
-from typing import Any
-
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.meshlab import add_to_meshset, from_meshset, to_meshset
 
 MAX_REPAIR_ITERATIONS = 4
 MAX_INTERSECTION_ITERATIONS = 20
@@ -142,7 +141,7 @@ def resolve_self_intersections(mesh: Mesh) -> Mesh:
 
 
 def _self_intersection_mask(mesh: Mesh) -> Bool[np.ndarray, "f"]:
-    meshes = _to_meshset(mesh)
+    meshes = to_meshset(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
     return np.asarray(meshes.current_mesh().face_selection_array(), dtype=bool)
 
@@ -157,10 +156,10 @@ def repair(mesh: Mesh) -> Mesh:
         mesh = largest_component(split_nonmanifold_vertices(_remove_invalid_faces(mesh)))
         if is_closed_manifold(mesh):
             return mesh
-        meshes = _to_meshset(mesh)
+        meshes = to_meshset(mesh)
         meshes.meshing_re_orient_faces_coherently()
         meshes.meshing_close_holes(maxholesize=len(mesh.faces), selfintersection=False)
-        mesh = _from_meshset(meshes)
+        mesh = from_meshset(meshes)
     raise OpenSurfaceError(f"a surface still has holes after {MAX_REPAIR_ITERATIONS} repair iterations")
 
 
@@ -203,9 +202,9 @@ def remesh_isotropic(
     Raises:
         OpenSurfaceError: the result could not be repaired.
     """
-    from pymeshlab import PureValue  # imported here for the reason given in `_to_meshset`
+    from pymeshlab import PureValue  # imported here for the reason given in `pipeline.geometry.meshlab`
 
-    meshes = _to_meshset(mesh, selected)
+    meshes = to_meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(
         iterations=iterations,
         selectedonly=selected is not None,
@@ -214,7 +213,7 @@ def remesh_isotropic(
         # Unchecked, it limits the projection back to the surface.
         maxsurfdist=PureValue(target_edge_m if tolerance_m is None else tolerance_m),
     )
-    return repair(_from_meshset(meshes))
+    return repair(from_meshset(meshes))
 
 
 def collapse_edges(mesh: Mesh, selected: Bool[np.ndarray, "f"], face_count: int, shape_weight: float = 0.6) -> Mesh:
@@ -230,7 +229,7 @@ def collapse_edges(mesh: Mesh, selected: Bool[np.ndarray, "f"], face_count: int,
     Raises:
         OpenSurfaceError: the result could not be repaired.
     """
-    meshes = _to_meshset(mesh, selected)
+    meshes = to_meshset(mesh, selected)
     meshes.meshing_decimation_quadric_edge_collapse(
         targetfacenum=face_count,
         qualitythr=shape_weight,
@@ -245,24 +244,19 @@ def collapse_edges(mesh: Mesh, selected: Bool[np.ndarray, "f"], face_count: int,
         planarweight=0.001,
         qualityweight=False,
     )
-    return repair(_from_meshset(meshes))
+    return repair(from_meshset(meshes))
 
 
-def _to_meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> Any:
-    import pymeshlab  # imported here because the import takes 0.25 s and few stages need it
+def subtract(mesh: Mesh, other: Mesh) -> Mesh:
+    """Return what of a closed surface is outside another one (exact boolean difference, libigl in MeshLab).
 
-    meshes = pymeshlab.MeshSet()
-    quality = None if selected is None else selected.astype(np.float64)
-    extra = {} if quality is None else {"f_scalar_array": quality}
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), **extra))
-    if quality is not None:
-        meshes.compute_selection_by_condition_per_face(condselect="fq > 0.5")
-    return meshes
-
-
-def _from_meshset(meshes: Any) -> Mesh:
-    current = meshes.current_mesh()
-    return Mesh(current.vertex_matrix().astype(np.float32), current.face_matrix().astype(np.int32))
+    Raises:
+        OpenSurfaceError: the result could not be repaired.
+    """
+    meshes = to_meshset(mesh)
+    add_to_meshset(meshes, other)
+    meshes.generate_boolean_difference(first_mesh=0, second_mesh=1)
+    return repair(from_meshset(meshes))
 
 
 def subdivide(mesh: Mesh, marked: Bool[np.ndarray, "f"]) -> tuple[Mesh, Int[np.ndarray, "n 2"]]:
@@ -382,13 +376,19 @@ def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> 
     return np.stack([1.0 - second - third, second, third], axis=1)
 
 
-def signed_distance_m(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:
-    """Return the distance (m) to a closed mesh, negative inside.
+def is_inside(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Bool[np.ndarray, "n"]:
+    """Return which points are inside a closed mesh: the generalised winding number is above one half.
 
-    A point is inside if its generalised winding number is above one half (Barill et al. 2018).
+    Barill et al., "Fast winding numbers for soups and clouds", 2018.
     """
+    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    query = np.ascontiguousarray(points, dtype=np.float64)
+    return np.asarray(igl.fast_winding_number(vertices, faces, query) > 0.5)
+
+
+def signed_distance_m(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:
+    """Return the distance (m) to a closed mesh, negative inside (`is_inside`)."""
     query = np.ascontiguousarray(points, dtype=np.float64)
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     squared, _, _ = igl.point_mesh_squared_distance(query, vertices, faces)
-    inside = igl.fast_winding_number(vertices, faces, query) > 0.5
-    return np.where(inside, -1.0, 1.0) * np.sqrt(np.maximum(squared, 0.0))
+    return np.where(is_inside(query, mesh), -1.0, 1.0) * np.sqrt(np.maximum(squared, 0.0))

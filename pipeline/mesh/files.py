@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.core.command import rerun_command
@@ -30,7 +30,8 @@ class MeshArtifact:
 
     mesh: vertices in m (float32) and faces. joint_indices, joint_weights: up to four influences per vertex, the largest
     first, sum 1. vertex_colours: sRGB in [0, 1]. unsplit: how normals are found where triangles were split. creases:
-    copies of vertices on folds, if these were made. The last two are not in the file.
+    copies of vertices on folds, if these were made. is_inside: vertices inside of a skirt or coat; None without one.
+    unsplit and creases are not in the file.
     """
 
     mesh: Mesh
@@ -39,6 +40,7 @@ class MeshArtifact:
     vertex_colours: Float[np.ndarray, "v 3"]
     unsplit: UnsplitNormals | None = None
     creases: Creases | None = None
+    is_inside: Bool[np.ndarray, "v"] | None = None
 
     def vertex_normals(self, posed: Float[np.ndarray, "v 3"] | None = None) -> Float[np.ndarray, "v 3"]:
         """Return unit normals of the surface as it was before its triangles were split, of each side of its folds.
@@ -57,6 +59,12 @@ class MeshArtifact:
         source = self.creases.source
         return np.where(folded[source][:, None], own, smooth[source])
 
+    def outside(self) -> Mesh:
+        """Return the surface without the inside of a skirt or coat; vertices stay."""
+        if self.is_inside is None:
+            return self.mesh
+        return Mesh(self.mesh.vertices, self.mesh.faces[~self.is_inside[self.mesh.faces].all(axis=1)])
+
     def dense_skin_weights(self, joint_count: int) -> Float[Tensor, "v j"]:
         """Return one row of skin weights per vertex."""
         indices, weights = torch.from_numpy(self.joint_indices), torch.from_numpy(self.joint_weights)
@@ -69,12 +77,14 @@ class MeshArtifact:
         dense = self.dense_skin_weights(int(self.joint_indices.max()) + 1).numpy()
         count = len(self.mesh.vertices)
         indices, weights = top_k_weights(cut.extend(dense)[count:], self.joint_indices.shape[1])
+        inside = self.is_inside
         return MeshArtifact(
             cut.apply(self.mesh),
             np.concatenate([self.joint_indices, indices.astype(self.joint_indices.dtype)]),
             np.concatenate([self.joint_weights, weights.astype(self.joint_weights.dtype)]),
             cut.extend(self.vertex_colours),
             UnsplitNormals(self.mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights),
+            is_inside=None if inside is None else np.concatenate([inside, inside[cut.corners].all(axis=1)]),
         )
 
     def split(self, creases: Creases) -> "MeshArtifact":
@@ -86,6 +96,7 @@ class MeshArtifact:
             joint_indices=self.joint_indices[source],
             joint_weights=self.joint_weights[source],
             vertex_colours=self.vertex_colours[source],
+            is_inside=None if self.is_inside is None else self.is_inside[source],
             creases=creases,
         )
 
@@ -99,6 +110,8 @@ def save_mesh(folder: Path, artifact: MeshArtifact) -> None:
         "joint_weights": artifact.joint_weights.astype(np.float32),
         "vertex_colors": artifact.vertex_colours.astype(np.float32),
     }
+    if artifact.is_inside is not None:
+        arrays["is_inside"] = artifact.is_inside
     save_npz(folder / MESH_NPZ, arrays)
 
 
@@ -111,7 +124,8 @@ def load_mesh(folder: Path) -> MeshArtifact:
     arrays = load_npz(folder / MESH_NPZ)
     try:
         mesh = Mesh(arrays["vertices"], arrays["faces"])
-        return MeshArtifact(mesh, arrays["joint_indices"], arrays["joint_weights"], arrays["vertex_colors"])
+        skin = arrays["joint_indices"], arrays["joint_weights"]
+        return MeshArtifact(mesh, *skin, arrays["vertex_colors"], is_inside=arrays.get("is_inside"))
     except KeyError as error:
         path = folder / MESH_NPZ
         raise UserError(f"{path} has no array {error}; run {rerun_command('mesh', folder)}") from None

@@ -9,6 +9,8 @@ A frontal video shows no back: there the surface lies on the legs of the fitted 
 Notation: v vertices, a directions around the legs, h heights.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import RegularGridInterpolator
@@ -25,9 +27,10 @@ from pipeline.template.chains import (
     chain_weights,
     joint_count,
     smooth,
-    weight_of,
 )
 from pipeline.template.sections import SLICE_M, Section, cut_at_height
+
+LEG_JOINTS = tuple(side + name for side in ("Right", "Left") for name in ("Foot", "Leg", "UpLeg"))
 
 MIN_SKIRT_M = 0.12
 """Least length of a skirt below the crotch of the body, which most low trousers and long shirts do not reach."""
@@ -62,17 +65,42 @@ _CORE = (0.3, 0.8)
 of a captured skirt closes it, directions and so the chains change from one vertex to the next."""
 
 
-def skirt_hem_m(mesh: Mesh, body: Body) -> tuple[float, float]:
-    """Return the lowest heights at which the surface and the body bridge both legs: the hem and the crotch."""
-    top_m = _top_m(body)
-    return _lowest_bridge_m(mesh, body, top_m), _lowest_bridge_m(Mesh(body.vertices, body.faces), body, top_m)
+@dataclass(frozen=True)
+class Hem:
+    """The hem of a skirt, or of a closed coat.
+
+    height_m, top_m: heights of the hem and of the hips, between which the skirt hangs.
+    garment: the captured surface without the faces of arms, which hang beside a skirt; vertices as before.
+    """
+
+    height_m: float
+    top_m: float
+    garment: Mesh
+
+
+def find_hem(mesh: Mesh, skin_weights: Float[np.ndarray, "v j"], body: Body) -> Hem | None:
+    """Return the hem of a skirt, or of the lower part of a closed coat; None for a person without.
+
+    Args:
+        mesh: the captured surface in the A-pose.
+        skin_weights: of its vertices.
+        body: the fitted body in the same pose and frame.
+    """
+    if not set(LEG_JOINTS) <= set(body.joint_names):
+        return None
+    on_arms = _on_arms(skin_weights, body)
+    garment, top_m = Mesh(mesh.vertices, mesh.faces[~on_arms[mesh.faces].any(axis=1)]), _top_m(body)
+    hem_m, crotch_m = (_lowest_bridge_m(surface, body, top_m) for surface in (garment, body.mesh()))
+    if crotch_m - hem_m < MIN_SKIRT_M or hem_step(garment, body, hem_m, crotch_m) < MIN_HEM_STEP:
+        return None
+    return Hem(hem_m, top_m, garment)
 
 
 def hem_step(mesh: Mesh, body: Body, hem_m: float, crotch_m: float) -> float:
     """Return how many times larger the convex hull of the surface is above the hem than below; inf on the ankles."""
     above = [_hull_area_m2(mesh, height_m) for height_m in np.arange(hem_m, crotch_m, SLICE_M)]
     below_m = np.arange(hem_m - HEM_BELOW_M, hem_m - MAX_GAP_M, SLICE_M)
-    below = [_hull_area_m2(mesh, height_m) for height_m in below_m[below_m > _ankle_m(body)]]
+    below = [_hull_area_m2(mesh, height_m) for height_m in below_m[below_m > ankle_height_m(body)]]
     return max(above, default=0.0) / float(np.median(below)) if below else np.inf
 
 
@@ -84,22 +112,22 @@ def find_skirt(body: Body, skinned: MeshArtifact, looseness: Float[np.ndarray, "
         skinned: the captured mesh in the same pose and frame.
         looseness: of each vertex, 0 on the body, 1 away from it.
     """
-    mesh = _without_arms(skinned, body)
-    hem_m, crotch_m = skirt_hem_m(mesh, body)
-    if crotch_m - hem_m < MIN_SKIRT_M or hem_step(mesh, body, hem_m, crotch_m) < MIN_HEM_STEP:
+    skin_weights = skinned.dense_skin_weights(len(body.joint_names)).numpy()
+    hem = find_hem(skinned.mesh, skin_weights, body)
+    if hem is None:
         return None
-    top_m = _top_m(body)
+    mesh, hem_m, top_m = hem.garment, hem.height_m, hem.top_m
     angles_rad = 2.0 * np.pi * np.arange(SKIRT_CHAINS) / SKIRT_CHAINS
     levels_m = np.linspace(top_m, hem_m + 0.5 * SLICE_M, joint_count(top_m - hem_m))
     rings_m = np.stack([_ring_m(mesh, body, float(height_m), angles_rad) for height_m in levels_m])
     vertices = skinned.mesh.vertices.astype(np.float64)
     along = (top_m - vertices[:, 1]) / (top_m - hem_m)
     heights_m = np.arange(hem_m, top_m + SLICE_M, SLICE_M)
-    middle_m = np.array([_leg_axis_m(body, height_m)[0] for height_m in heights_m.tolist()])
+    middle_m = np.array([leg_axis_m(body, height_m)[0] for height_m in heights_m.tolist()])
     offset_m = vertices[:, [0, 2]] - np.stack([np.interp(vertices[:, 1], heights_m, x) for x in middle_m.T], axis=1)
     around_rad = np.arctan2(*offset_m.T)
     places = np.column_stack([vertices[:, 1], around_rad, offset_m])
-    amount = _cloth_amount(mesh, body, (hem_m, top_m), places, looseness) * ~_on_arms(skinned, body)
+    amount = _cloth_amount(mesh, body, (hem_m, top_m), places, looseness) * ~_on_arms(skin_weights, body)
     of_chain = between_angles(around_rad, angles_rad)
     weights = chain_weights(smooth(amount, skinned.mesh), of_chain, along, len(levels_m) - 1)
     return LoosePart("skirt", tuple(Chain("Hips", rings_m[:, k]) for k in range(SKIRT_CHAINS)), weights)
@@ -109,13 +137,13 @@ def _ring_m(mesh: Mesh, body: Body, height_m: float, angles_rad: Float[np.ndarra
     """Return a point of the outer surface in each direction; across gaps one of the convex hull."""
     surface_m, hull_m = _reach_m(mesh, body, height_m, angles_rad)
     distance_m = np.where(surface_m > RING_SHARE * hull_m, surface_m, hull_m)  # nan is False
-    points_m = _leg_axis_m(body, height_m)[0] + distance_m[:, None] * _directions(angles_rad)
+    points_m = leg_axis_m(body, height_m)[0] + distance_m[:, None] * _directions(angles_rad)
     return np.column_stack([points_m[:, 0], np.full(len(points_m), height_m), points_m[:, 1]])
 
 
 def _reach_m(mesh: Mesh, body: Body, height_m: float, angles_rad: Float[np.ndarray, "a"]) -> Float[np.ndarray, "2 a"]:
     """Return how far the outermost surface (nan: none) and the convex hull are from midway between the legs."""
-    section, (middle_m, _) = cut_at_height(mesh, height_m), _leg_axis_m(body, height_m)
+    section, (middle_m, _) = cut_at_height(mesh, height_m), leg_axis_m(body, height_m)
     towards = _directions(angles_rad)
     points = [section.exit_point_m(middle_m, direction) for direction in towards]
     surface_m = [np.nan if point is None else float(np.linalg.norm(point - middle_m)) for point in points]
@@ -155,8 +183,8 @@ def _cloth_amount(
 def _lowest_bridge_m(mesh: Mesh, body: Body, top_m: float) -> float:
     """Return the lowest height, from `top_m` down over folds and short gaps, at which a surface bridges both legs."""
     lowest_m = last_m = top_m
-    for height_m in np.arange(top_m, _ankle_m(body), -SLICE_M).tolist():
-        share = _bridge_share(cut_at_height(mesh, height_m), *_leg_axis_m(body, height_m))
+    for height_m in np.arange(top_m, ankle_height_m(body), -SLICE_M).tolist():
+        share = _bridge_share(cut_at_height(mesh, height_m), *leg_axis_m(body, height_m))
         if share > BRIDGE_SHARE:
             lowest_m = height_m
         if share > FOLD_SHARE:
@@ -190,11 +218,12 @@ def _top_m(body: Body) -> float:
     return float(body.joints_m[[body.joint("LeftUpLeg"), body.joint("RightUpLeg")], 1].mean())
 
 
-def _ankle_m(body: Body) -> float:
+def ankle_height_m(body: Body) -> float:
+    """Return the height of the ankles, m."""
     return float(body.joints_m[[body.joint("LeftFoot"), body.joint("RightFoot")], 1].mean())
 
 
-def _leg_axis_m(body: Body, height_m: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+def leg_axis_m(body: Body, height_m: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return x and z midway between the axes of the legs at a height, and half the way from right to left."""
     points = []
     for side in ("Right", "Left"):
@@ -203,12 +232,6 @@ def _leg_axis_m(body: Body, height_m: float) -> tuple[Float[np.ndarray, "2"], Fl
     return 0.5 * (points[0] + points[1]), 0.5 * (points[1] - points[0])
 
 
-def _on_arms(skinned: MeshArtifact, body: Body) -> Bool[np.ndarray, "v"]:
-    names = tuple(name for name in body.joint_names if "Arm" in name or "Hand" in name)
-    return np.asarray(weight_of(skinned, body, names) > 0.5)
-
-
-def _without_arms(skinned: MeshArtifact, body: Body) -> Mesh:
-    """Return the mesh without the faces of arms, which hang beside a skirt."""
-    on_arms = _on_arms(skinned, body)
-    return Mesh(skinned.mesh.vertices, skinned.mesh.faces[~on_arms[skinned.mesh.faces].any(axis=1)])
+def _on_arms(skin_weights: Float[np.ndarray, "v j"], body: Body) -> Bool[np.ndarray, "v"]:
+    joints = [k for k, name in enumerate(body.joint_names) if "Arm" in name or "Hand" in name]
+    return np.asarray(skin_weights[:, joints].sum(axis=1) > 0.5)

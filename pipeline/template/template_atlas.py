@@ -3,7 +3,8 @@
 The person's triangles are split where the nearest chart of the registered template changes. A corner has the texture
 coordinates of the nearest point of its chart. Where this map folds over (in folds of cloth, at ears and between
 fingers), its vertices move to the mean of their neighbours. What still folds, overlaps, or is squeezed, such as skirts
-and long hair, gets charts of its own in the square that the layout reserves for them.
+and long hair, gets charts of its own in the square that the layout reserves for them. So does the inside of a skirt,
+which no frame shows, with fewer texels.
 """
 
 from dataclasses import dataclass
@@ -38,6 +39,9 @@ MAX_HALVES_GAP = 0.005
 """Places of a vertex in both halves of a chart that are nearer (in sides of the texture; 1 cm) are one: there is no
 cut."""
 
+INSIDE_SCALE = 0.3
+"""Size of the charts of the inside of a skirt, over that of other charts of their own."""
+
 _LOOSE_RINGS = 1
 _UNFOLDING_STEPS = 6
 _RESERVED_MARGIN = 0.01
@@ -63,7 +67,13 @@ class TemplateAtlas:
     folded_faces: int
 
 
-def build_template_atlas(mesh: Mesh, registration: Registration, size_px: int, padding_px: int) -> TemplateAtlas:
+def build_template_atlas(
+    mesh: Mesh,
+    registration: Registration,
+    size_px: int,
+    padding_px: int,
+    is_inside: Bool[np.ndarray, "v"] | None = None,
+) -> TemplateAtlas:
     """Lay a person's mesh out on the template's charts.
 
     Args:
@@ -71,6 +81,7 @@ def build_template_atlas(mesh: Mesh, registration: Registration, size_px: int, p
         registration: of the template on it.
         size_px: side of the texture.
         padding_px: smallest distance between charts of loose parts, texels.
+        is_inside: vertices inside of a skirt or coat; None without one.
     """
     layout, template = load_layout(), load_template()
     skin, region = registration.skin(), (2 * layout.chart + layout.half)[template.skin_faces]
@@ -83,11 +94,14 @@ def build_template_atlas(mesh: Mesh, registration: Registration, size_px: int, p
     uv, faces_uv, vertex_of_uv = _place(surface, region_of_face, registration)
     folded = int((_signed_areas(uv, faces_uv) <= 0.0).sum())
     uv = _unfold(uv, faces_uv)
-    loose = _loose_faces(surface, uv, faces_uv, chart_of_face, size_px)
+    inside = np.zeros(len(surface.faces), dtype=bool)
+    if is_inside is not None:
+        inside = np.concatenate([is_inside, is_inside[cut.corners].all(axis=1)])[surface.faces].all(axis=1)
+    loose = inside | _loose_faces(surface, uv, faces_uv, chart_of_face, size_px, inside)
     areas_m2 = surface.face_areas_m2()
     share = float(areas_m2[loose].sum() / areas_m2.sum())
     atlas = _with_loose_charts(
-        surface, Atlas(uv.astype(np.float32), faces_uv, vertex_of_uv), loose, size_px, padding_px
+        surface, Atlas(uv.astype(np.float32), faces_uv, vertex_of_uv), loose, inside, size_px, padding_px
     )
     return TemplateAtlas(cut, atlas, loose, share, folded)
 
@@ -156,9 +170,13 @@ def _loose_faces(
     faces_uv: Int[np.ndarray, "f 3"],
     chart_of_face: Int[np.ndarray, "f"],
     size_px: int,
+    inside: Bool[np.ndarray, "f"],
 ) -> Bool[np.ndarray, "f"]:
-    """Return the faces that are folded, squeezed, or lie on others, and small pieces between them."""
-    loose = _signed_areas(uv, faces_uv) <= 1e-10
+    """Return the faces that are folded, squeezed, or lie on others, and small pieces between them.
+
+    inside: faces that count as loose.
+    """
+    loose = inside | (_signed_areas(uv, faces_uv) <= 1e-10)
     smallest = _smallest_stretch(surface, uv, faces_uv)
     for number in np.unique(chart_of_face):
         rows = chart_of_face == number
@@ -228,15 +246,27 @@ def _overlapping(
 
 
 def _with_loose_charts(
-    surface: Mesh, atlas: Atlas, loose: Bool[np.ndarray, "f"], size_px: int, padding_px: int
+    surface: Mesh,
+    atlas: Atlas,
+    loose: Bool[np.ndarray, "f"],
+    inside: Bool[np.ndarray, "f"],
+    size_px: int,
+    padding_px: int,
 ) -> Atlas:
-    """Return the atlas with charts of the loose faces in the reserved square."""
+    """Return the atlas with charts of the loose faces in the reserved square.
+
+    inside: those of them whose charts are smaller (`INSIDE_SCALE`).
+    """
     if not loose.any():
         return atlas
     left, bottom, right, top = load_layout().reserved
     rows = np.flatnonzero(loose)
     side = right - left - _RESERVED_MARGIN
-    part = Mesh(surface.vertices, surface.faces[rows])
+    count = len(surface.vertices)
+    part = Mesh(
+        np.concatenate([surface.vertices, INSIDE_SCALE * surface.vertices]).astype(np.float32),
+        surface.faces[rows] + np.int32(count) * inside[rows, None],
+    )
     own = unwrap(part, _pieces(part.faces), int(side * size_px), padding_px)
     kept, corners = np.unique(atlas.faces_uv[~loose], return_inverse=True)
     faces_uv = np.zeros_like(atlas.faces_uv)
@@ -247,5 +277,5 @@ def _with_loose_charts(
     return Atlas(
         np.concatenate([atlas.uv[kept], placed + offset]).astype(np.float32),
         faces_uv,
-        np.concatenate([atlas.vertex_of_uv[kept], own.vertex_of_uv]).astype(np.int32),
+        np.concatenate([atlas.vertex_of_uv[kept], own.vertex_of_uv % count]).astype(np.int32),
     )

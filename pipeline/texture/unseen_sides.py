@@ -4,7 +4,7 @@ Hems go around a body, and hair around a head. Harmonic interpolation fills smal
 person who was filmed from in front a mixture of shirt, trousers, skin and hair.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -54,7 +54,7 @@ _AXES = {
 
 @dataclass(frozen=True)
 class BodySlices:
-    """Part of the body (an index into `BODY_PARTS`) and slice along its axis of each vertex; slice -1 for hands."""
+    """Part of the body (an index into `BODY_PARTS`) and slice along its axis of each vertex; -1: none, as for hands."""
 
     part: Int[np.ndarray, "v"]
     number: Int[np.ndarray, "v"]
@@ -81,6 +81,25 @@ class BodySlices:
                 along_m = vertices_m[rows] @ axis
                 number[rows] = np.floor((along_m - along_m.min()) / SLICE_M)
         return cls(part, number)
+
+    def without(self, vertices: Bool[np.ndarray, "v"]) -> "BodySlices":
+        """Return the slices without some vertices, such as those inside of a skirt: its outside does not tell them."""
+        return replace(self, number=np.where(vertices, -1, self.number))
+
+
+def add_unseen_colours(
+    vertices: Int[np.ndarray, "k"],
+    of_vertices: Float[np.ndarray, "k 3"],
+    colour: Float[np.ndarray, "v 3"],
+    weight: Float[np.ndarray, "v"],
+) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v"]]:
+    """Return colours and weights in which some vertices have given colours, unless they are seen.
+
+    weight: of the observations, in [0, 1].
+    """
+    colour, weight, unseen = colour.copy(), weight.copy(), weight[vertices] < UNSEEN
+    colour[vertices[unseen]], weight[vertices[unseen]] = of_vertices[unseen], SLICE_WEIGHT
+    return colour, weight
 
 
 def add_slice_colours(

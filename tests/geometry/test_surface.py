@@ -10,6 +10,7 @@ from pipeline.geometry.surface import (
     closest_points_on_mesh,
     count_self_intersecting_faces,
     is_closed_manifold,
+    is_inside,
     isosurface,
     laplacian,
     largest_component,
@@ -22,6 +23,7 @@ from pipeline.geometry.surface import (
     smooth_taubin,
     split_nonmanifold_vertices,
     subdivide,
+    subtract,
     weld_vertices,
 )
 
@@ -244,6 +246,19 @@ def test_closest_point_against_brute_force(sphere: Mesh) -> None:
 def test_signed_distance_of_a_sphere(sphere: Mesh) -> None:
     points = np.random.default_rng(6).uniform(-0.7, 0.7, size=(300, 3))
     np.testing.assert_allclose(signed_distance_m(points, sphere), np.linalg.norm(points, axis=1) - 0.5, atol=0.005)
+
+
+def test_the_difference_of_two_balls_is_a_shell_with_an_opening(sphere: Mesh) -> None:
+    """A ball of half the radius that reaches through the surface: what is left has the volume of the rest."""
+    radius_m = float(np.linalg.norm(sphere.vertices, axis=1).mean())
+    centre = np.array([0.0, 0.0, 0.6 * radius_m], np.float32)
+    ball = Mesh((0.5 * sphere.vertices + centre).astype(np.float32), sphere.faces)
+    rest = subtract(sphere, ball)
+    assert is_closed_manifold(rest)
+    points = np.random.default_rng(0).uniform(-radius_m, radius_m, (4000, 3))
+    expected = is_inside(points, sphere) & ~is_inside(points, ball)
+    assert (is_inside(points, rest) == expected).mean() > 0.999
+    assert expected.mean() < is_inside(points, sphere).mean() - 0.03
 
 
 def test_welding_closes_a_surface_whose_faces_have_their_own_vertices(sphere: Mesh) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pipeline.core.errors import UserError
+from pipeline.geometry.creases import Creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface_cut import cut_at_borders
 from pipeline.io.npz import load_npz, save_npz
@@ -46,6 +47,26 @@ def test_a_mesh_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.mesh.faces, TETRAHEDRON.faces)
     for name in ("joint_indices", "joint_weights", "vertex_colours"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(ARTIFACT, name))
+
+
+def test_what_is_inside_of_a_skirt_is_read_back_cut_and_split(tmp_path: Path) -> None:
+    assert load_mesh_after_saving(tmp_path, ARTIFACT).is_inside is None
+    inside = np.array([True, True, False, True])
+    loaded = load_mesh_after_saving(tmp_path, replace(ARTIFACT, is_inside=inside))
+    np.testing.assert_array_equal(loaded.is_inside, inside)
+    cut, _ = cut_at_borders(TETRAHEDRON, lambda points_m: (points_m[:, 0] > 0.3).astype(np.int64))
+    of_cut = loaded.cut(cut).is_inside
+    np.testing.assert_array_equal(of_cut[:4], inside)
+    np.testing.assert_array_equal(of_cut[4:], inside[cut.corners].all(axis=1))
+    assert of_cut[4:].any()
+    assert not of_cut[4:].all()
+    creases = Creases(np.array([0, 1, 2, 3, 2]), TETRAHEDRON.faces)
+    np.testing.assert_array_equal(loaded.split(creases).is_inside, [True, True, False, True, False])
+
+
+def load_mesh_after_saving(folder: Path, artifact: MeshArtifact) -> MeshArtifact:
+    save_mesh(folder, artifact)
+    return load_mesh(folder)
 
 
 def test_the_dense_mesh_is_read_back(tmp_path: Path) -> None:

@@ -92,6 +92,9 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     assert metrics["camera_pitch_deg"] == pytest.approx(0.0, abs=3.0)
     assert metrics["camera_roll_deg"] == pytest.approx(0.0, abs=3.0)
     assert 0.7 < motion.root_translation_m[:, 1].mean() < 1.2
+    bare = load_body(out / "bare.npz")
+    assert np.abs(bare.joints_m - body.joints_m).max() < 0.005
+    assert bare.vertices.shape == body.vertices.shape
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
     scores = load_scores(out / "scores.npz")

@@ -20,7 +20,7 @@ from pipeline.field.field import FieldColours, RadianceField, hash_grid_layout
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_quaternion
-from pipeline.geometry.surface import isosurface
+from pipeline.geometry.surface import OpenSurfaceError, isosurface
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.kernels.hashgrid import FeatureGradients
@@ -100,7 +100,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     index = np.arange(FRAMES, dtype=np.int32)
     root_translation_m = np.tile(np.array([0.0, -0.4, -2.0], dtype=np.float32), (FRAMES, 1))
     motion = Motion(index, index / 30.0, axis_angle_to_quaternion(turns)[:, None].numpy(), root_translation_m)
-    save_body(folders["body"] / "body.npz", body)
+    for name in ("body.npz", "bare.npz"):
+        save_body(folders["body"] / name, body)
     save_camera(folders["body"] / "camera.npz", CAMERA)
     save_npz(folders["body"] / SCORES_NPZ, {"usable": np.ones(FRAMES, dtype=bool)})
     for name in ("body", "field"):
@@ -305,9 +306,23 @@ def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -
     mesh = capsule_mesh(0.18)
     share = torch.linspace(0.0, 1.0, len(mesh.vertices))
     skin = build_skinned_topology(mesh, torch.stack([1 - share, share], dim=1))
-    mesh_stage.write_results(tmp_path, mesh, skin, FieldColours(CapsuleField()))
+    mesh_stage.write_results(tmp_path, mesh, skin, FieldColours(CapsuleField()), None)
     exported = load_mesh(tmp_path).dense_skin_weights(2)
     np.testing.assert_allclose(exported[:, 1], share, atol=1e-6)
+
+
+def test_a_skirt_that_cannot_be_made_hollow_stays_closed_with_a_warning(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+
+    def fail(*arguments: object) -> Mesh:
+        raise OpenSurfaceError("a surface still has holes")
+
+    monkeypatch.setattr(mesh_stage, "find_cavity", lambda *arguments: capsule_mesh(0.05))
+    monkeypatch.setattr(mesh_stage, "cut_out", fail)
+    run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
+    assert load_mesh(tmp_path).is_inside is None
+    assert any("the inside of the skirt stays closed" in warning for warning in take_warnings())
 
 
 def test_the_psnr_of_the_manifest_is_that_of_the_written_mesh(

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.body.files import load_body
 from pipeline.mesh.files import load_mesh
 from pipeline.texture.body_parts import BODY_PARTS
-from pipeline.texture.unseen_sides import SLICE_M, SLICE_WEIGHT, BodySlices, add_slice_colours
+from pipeline.texture.unseen_sides import SLICE_M, SLICE_WEIGHT, BodySlices, add_slice_colours, add_unseen_colours
 
 RED, BLUE, WHITE, BLACK = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 TORSO, HANDS = BODY_PARTS.index("torso"), BODY_PARTS.index("left hand")
@@ -68,6 +68,27 @@ def test_slices_that_are_not_seen_nearby_have_no_colour() -> None:
     back = angle_deg > 120.0
     assert np.all(weight[back & (height_m < 0.3)] == 0.0)
     assert np.all(weight[back & (height_m > 0.4)] == SLICE_WEIGHT)
+
+
+def test_given_colours_fill_what_is_not_seen_and_nothing_else() -> None:
+    vertices, angle_deg, _, _ = pillar()
+    before = filmed(angle_deg < 90.0, np.broadcast_to(RED, vertices.shape))
+    rows = np.flatnonzero((angle_deg > 80.0) & (angle_deg < 120.0))
+    colour, weight = add_unseen_colours(rows, np.tile(BLUE, (len(rows), 1)), *before)
+    unseen = np.isin(np.arange(len(vertices)), rows) & (angle_deg >= 90.0)
+    assert np.all(colour[unseen] == BLUE)
+    assert np.all(weight[unseen] == SLICE_WEIGHT)
+    for old, new in zip(before, (colour, weight), strict=True):
+        np.testing.assert_array_equal(old[~unseen], new[~unseen])
+
+
+def test_what_is_inside_of_a_skirt_takes_no_colour_of_its_slice() -> None:
+    vertices, angle_deg, _, slices = pillar()
+    inside = angle_deg > 150.0
+    seen = filmed(angle_deg < 90.0, np.broadcast_to(RED, vertices.shape))
+    _, weight = add_slice_colours(vertices, slices.without(inside), *seen)
+    assert np.all(weight[inside] == 0.0)
+    assert np.all(weight[(angle_deg > 120.0) & ~inside] == SLICE_WEIGHT)
 
 
 def test_hands_and_people_whom_no_frame_shows_stay_as_they_are() -> None:

@@ -60,6 +60,10 @@ class FitContext:
             bare = fill_clothes(clothed, bare, prior, self._linearise_bare)
         return self.body.at_shape(bare.float())
 
+    def bare_body(self, clothed: LinearBody) -> Body:
+        """Return the body below the clothes of a body from `linearise`."""
+        return self.body.at_shape(self._split(clothed.shape)[0].float())
+
     def _linearise_bare(self, bare: Float[Tensor, "s"]) -> LinearBody:
         """Return the bare body linearised around a shape."""
         return linearise_body(self.body, bare, self.curls_rad)

@@ -353,6 +353,7 @@ def _result(
     quaternions = matrix_to_quaternion(model.all_joint_rotations(state.rotations))
     return FitResult(
         body=context.filled_body(model),
+        bare=context.bare_body(model),
         rotations_wxyz=continuous_quaternions(quaternions).float().numpy(),
         root_translation_m=state.root_m.float().numpy(),
         camera=apply_intrinsics_delta(observations.camera, state.intrinsics_delta),

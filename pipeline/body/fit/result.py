@@ -23,6 +23,7 @@ RELIABLE_CONFIDENCE = 0.5
 class FitResult:
     """The fitted person and camera, n frames.
 
+    body, bare: the person in clothes, as the body that fills them, and without; the same if no clothes were fitted.
     landmark_error_px, silhouette_iou: of each frame; nan without landmarks or mask. The silhouette is that of the
         clothed body.
     left_right_swapped: by body part, the frames whose landmarks were swapped.
@@ -33,6 +34,7 @@ class FitResult:
     """
 
     body: Body
+    bare: Body
     rotations_wxyz: Float[np.ndarray, "n full 4"]
     root_translation_m: Float[np.ndarray, "n 3"]
     camera: Camera

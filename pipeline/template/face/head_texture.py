@@ -64,7 +64,7 @@ def register_person(
         landmarks = find_landmarks(body, skinned, views, faces, make_detector, settings)
         if checkpoint is not None:
             save_landmarks(checkpoint, landmarks)
-    return register_template(body, skinned.mesh, landmarks)
+    return register_template(body, skinned.outside(), landmarks)
 
 
 def find_landmarks(

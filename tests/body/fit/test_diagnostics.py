@@ -35,6 +35,7 @@ def result(**changes: object) -> FitResult:
     """Return a good fit of a person at 2 m, about 460 pixels tall."""
     fields: dict[str, object] = {
         "body": default_body(),
+        "bare": default_body(),
         "rotations_wxyz": np.tile(np.float32([1, 0, 0, 0]), (FRAMES, 52, 1)),
         "root_translation_m": np.tile(np.float32([0, 0, -2]), (FRAMES, 1)),
         "camera": CAMERA,

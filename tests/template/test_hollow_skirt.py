@@ -1,0 +1,152 @@
+"""The inside of a captured skirt is cut out: what was closed at the hem is cloth of a known thickness, and legs."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from pipeline.body.body import Body, load_anny
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import (
+    closest_points_on_mesh,
+    count_self_intersecting_faces,
+    is_closed_manifold,
+    is_inside,
+    isosurface,
+    largest_component,
+    signed_distance_m,
+)
+from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin_weights
+from pipeline.template.hollow_skirt import THICKNESS_M, cut_out, find_cavity, find_lining, hollow_skin, vertices_inside
+from pipeline.template.regions import outer_surface
+
+SPACING_M, EDGE_M = 0.012, 0.012
+HEM_M, WAIST_M = 0.62, 1.0
+HEM_RADIUS_M, WAIST_RADIUS_M = 0.3, 0.14
+
+
+def radius_m(height_m: np.ndarray) -> np.ndarray:
+    """Radius of the skirt, a cone around the hips."""
+    return np.interp(height_m, (HEM_M, WAIST_M), (HEM_RADIUS_M, WAIST_RADIUS_M))
+
+
+@lru_cache(maxsize=3)
+def filmed(trousers_m: float = 0.0, has_skirt: bool = True) -> tuple[Mesh, Body]:
+    """What frames show of a person: a skirt that is solid down to its hem, and legs in trousers of a thickness."""
+    model = load_anny()
+    body = model.at_shape(model.shape_defaults)
+    low, high = body.vertices.min(axis=0) - 0.05, body.vertices.max(axis=0) + 0.05
+    low[2], high[2] = hips_z_m(body) - 1.1 * HEM_RADIUS_M, hips_z_m(body) + 1.1 * HEM_RADIUS_M
+    axes = [np.arange(first, last, SPACING_M) for first, last in zip(low, high, strict=True)]
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    distance_m = signed_distance_m(points, outer_surface(body)).reshape(x.shape)
+    distance_m -= trousers_m * ((y > 0.15) & (y < WAIST_M))
+    if has_skirt:
+        cone_m = np.hypot(x, z - hips_z_m(body)) - radius_m(y)
+        distance_m = np.minimum(distance_m, np.maximum(cone_m, np.maximum(HEM_M - y, y - WAIST_M)))
+    return largest_component(isosurface(-distance_m, 0.0, low, SPACING_M)), body
+
+
+def hips_z_m(body: Body) -> float:
+    return float(body.joints_m[body.joint("LeftUpLeg"), 2])
+
+
+@lru_cache(maxsize=2)
+def hollow(trousers_m: float = 0.0) -> tuple[Mesh, np.ndarray]:
+    """The person with a hollow skirt, and which vertices are inside of it."""
+    solid, body = filmed(trousers_m)
+    cavity = find_cavity(solid, transfer_skin_weights(solid, body), body, body, EDGE_M, 2000)
+    found = cut_out(solid, cavity)
+    return found, vertices_inside(found, cavity)
+
+
+def test_a_skirt_is_hollow_and_open_at_its_hem() -> None:
+    (solid, body), (found, _) = filmed(), hollow()
+    assert is_closed_manifold(found)
+    assert count_self_intersecting_faces(found) == 0
+    angle, height_m = (
+        each.ravel() for each in np.meshgrid(np.arange(0.0, 2.0 * np.pi, 0.25), np.linspace(HEM_M + 0.01, 0.72, 6))
+    )
+    beside_cloth_m = radius_m(height_m) - 0.03
+    points = np.stack(
+        [beside_cloth_m * np.sin(angle), height_m, hips_z_m(body) + beside_cloth_m * np.cos(angle)], axis=1
+    )
+    assert is_inside(points, solid).all()
+    assert not is_inside(points, found).any()
+
+
+def test_cloth_has_a_thickness_and_its_outside_stays() -> None:
+    (solid, body), (found, inside) = filmed(), hollow()
+    height_m, out_m = solid.vertices[:, 1], np.hypot(solid.vertices[:, 0], solid.vertices[:, 2] - hips_z_m(body))
+    outer = (height_m > HEM_M + 0.02) & (out_m > radius_m(height_m) - 0.004) | (height_m > WAIST_M + 0.02)
+    assert closest_points_on_mesh(solid.vertices[outer], found)[0].max() < 1e-4
+    at = found.vertices[find_lining(found, inside).vertices].astype(np.float64)
+    at = at[at[:, 1] < 0.8]
+    thickness_m = radius_m(at[:, 1]) - np.hypot(at[:, 0], at[:, 2] - hips_z_m(body))
+    assert len(at) > 50
+    assert np.median(thickness_m) == pytest.approx(THICKNESS_M, abs=0.004)
+    assert np.quantile(np.abs(thickness_m - THICKNESS_M), 0.95) < 0.01
+
+
+@pytest.mark.parametrize("trousers_m", [0.0, 0.02])
+def test_legs_go_on_in_the_skirt_with_what_is_worn_below_it(trousers_m: float) -> None:
+    (solid, body), (found, _) = filmed(trousers_m), hollow(trousers_m)
+    names = ("LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg")
+    of_legs = body.skin_weights[:, [body.joint(name) for name in names]].sum(axis=1) > 0.9
+    height_m = body.vertices[:, 1]
+    hidden = of_legs & (np.abs(body.vertices[:, 0]) > 0.06) & (height_m > HEM_M + 0.02) & (height_m < 0.75)
+    assert hidden.sum() > 100
+    worn = body.vertices[hidden] + trousers_m * body.mesh().vertex_normals()[hidden]
+    assert np.quantile(closest_points_on_mesh(worn, found)[0], 0.9) < 0.008
+    # In the solid skirt these places are deep inside.
+    assert np.median(signed_distance_m(worn, solid)) < -0.03
+
+
+def test_both_sides_of_the_cloth_belong_together() -> None:
+    found, inside = hollow()
+    lining = find_lining(found, inside)
+    assert inside[lining.vertices].all()
+    assert not inside[lining.corners].any()
+    outer_m = lining.of_outer_side(found.vertices.astype(np.float64))
+    assert np.linalg.norm(outer_m - found.vertices[lining.vertices], axis=1).max() < 0.02
+    legs = np.setdiff1d(np.flatnonzero(inside), lining.vertices)
+    near_axis = np.abs(np.abs(found.vertices[legs, 0]) - 0.1) < 0.1
+    assert (near_axis & (found.vertices[legs, 1] < 0.7)).sum() > 20
+
+
+def test_a_person_without_a_skirt_stays_as_filmed() -> None:
+    mesh, body = filmed(has_skirt=False)
+    assert find_cavity(mesh, transfer_skin_weights(mesh, body), body, body, EDGE_M, 2000) is None
+
+
+def test_faces_are_limited() -> None:
+    solid, body = filmed()
+    cavity = find_cavity(solid, transfer_skin_weights(solid, body), body, body, EDGE_M, 600)
+    assert cavity is not None
+    assert len(cavity.faces) <= 600
+    found = cut_out(solid, cavity, len(solid.faces) - 200)
+    assert len(found.faces) <= len(solid.faces) - 200
+    assert is_closed_manifold(found)
+
+
+def test_the_outside_moves_as_before_and_the_lining_with_it() -> None:
+    """The solid skirt is given skin weights that tell heights and sides; legs have those of the body."""
+    (solid, body), (found, inside) = filmed(), hollow()
+    joints = [body.joint(name) for name in ("Hips", "LeftUpLeg", "RightUpLeg")]
+    share = np.clip((solid.vertices[:, [1]] - HEM_M) / (WAIST_M - HEM_M), 0.0, 1.0)
+    sides = np.clip(0.5 + solid.vertices[:, [0]], 0.0, 1.0)
+    given = np.zeros((len(solid.vertices), len(body.joint_names)), np.float32)
+    given[:, joints] = np.concatenate([share, (1.0 - share) * sides, (1.0 - share) * (1.0 - sides)], axis=1)
+    skin = hollow_skin(found, solid, build_skinned_topology(solid, torch.from_numpy(given)), body, inside)
+    weights, lining = skin.weights.numpy(), find_lining(found, inside)
+    nearest_m, nearest = cKDTree(solid.vertices).query(found.vertices)
+    same = nearest_m == 0.0
+    assert same.sum() > 1000
+    np.testing.assert_allclose(weights[same], given[nearest[same]], atol=1e-6)
+    np.testing.assert_allclose(weights[lining.vertices], lining.of_outer_side(weights), atol=0.02)
+    legs = np.setdiff1d(np.flatnonzero(inside & (nearest_m > 0.03)), lining.vertices)
+    of_legs = weights[legs][:, [k for k, name in enumerate(body.joint_names) if "Leg" in name]].sum(axis=1)
+    assert np.median(of_legs[found.vertices[legs, 1] < 0.7]) > 0.9
