@@ -134,21 +134,24 @@ def gaps_in_skirt(
 
     Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice from
     `SKIRT_ABOVE_CROTCH_M` above the crotch down to the hem, or to where the legs part, the piece that holds both is
-    closed by a disc of `SKIRT_RADIUS_M`; then all slices together by a ball.
+    closed by a disc of `SKIRT_RADIUS_M`; then all slices together by a ball. Above a hem, holes may part the legs in
+    slices between others that join them; the pieces of both legs are closed there.
     """
     gaps, body = np.zeros_like(inside), body_distance_m < 0.0
     middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
     hem = hem_row(inside, body_distance_m, crotch_m, origin_m, spacing_m)
     top = min(crotch + round(SKIRT_ABOVE_CROTCH_M / spacing_m), inside.shape[1]) if crotch else 0
-    skirt = np.zeros_like(inside)
+    skirt, is_joined = np.zeros_like(inside), np.zeros(inside.shape[1], dtype=bool)
     for row in range(top - 1, hem - 1, -1):
         labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
         legs = np.where(body[:, row], labels, 0)
         joined = np.intersect1d(legs[:middle], legs[middle:])
-        if not joined.any():
+        is_joined[row] = joined.any()
+        if not is_joined[row] and not hem:
             break
-        skirt[:, row] = np.isin(labels, joined[joined > 0])
-    rows = np.flatnonzero(skirt.any(axis=(0, 2)))
+        held = joined if is_joined[row] else np.unique(legs)
+        skirt[:, row] = np.isin(labels, held[held > 0])
+    rows = np.flatnonzero(is_joined)
     if spacing_m * np.count_nonzero(rows < crotch) < MAX_JOINED_M:
         return gaps
     part = np.s_[:, rows[0] : rows[-1] + 1]

@@ -153,6 +153,16 @@ def test_a_slot_across_the_front_of_a_skirt_is_a_gap() -> None:
     assert not gaps[~slot].any()
 
 
+def test_a_hole_through_a_skirt_that_parts_it_is_a_gap_above_a_hem() -> None:
+    """Between the legs, from front to back, 4 cm high; bare legs below the hem."""
+    grid, (x, y, z) = leg_grid()
+    skirt = (np.hypot(x, 1.3 * z) < 0.24) & (y > 0.1)
+    hole = skirt & (np.abs(x) < 0.04) & (np.abs(y - 0.3) < 0.02)
+    gaps = gaps_in_skirt((skirt & ~hole) | (grid[0] < 0.0), *grid)
+    assert gaps[hole].mean() > 0.9
+    assert not gaps[~hole].any()
+
+
 def test_a_coat_has_no_holes_above_the_crotch() -> None:
     grid, (x, y, z) = leg_grid()
     coat = (np.hypot(x, 1.25 * z) < 0.24) & (y > 0.1)
