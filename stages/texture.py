@@ -256,7 +256,7 @@ def build_atlas(
     """
     footprints_m = [pixel_footprint_m(view.vertices_world, view.camera) for view in views]
     texel_size_m = float(np.median(footprints_m)) / settings.texels_per_pixel
-    area_m2 = float(skinned.mesh.face_areas_m2().sum())
+    area_m2 = float(skinned.outside().face_areas_m2().sum())
     size_px = texture_size_px(area_m2, texel_size_m, config.min_texture_px, config.max_texture_px)
     if config.atlas == "template" and registration is None:
         warn("texture.atlas=template needs the built-in body, not one of a model file: the layout is the person's own")

@@ -172,7 +172,7 @@ def _sampled_cavity(mesh: Mesh, hem: Hem, body: Body, bare: Body) -> Mesh | None
     points_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = is_inside(points_m, mesh).reshape(shape)
     legs = outer_surface(bare)
-    free_m = signed_distance_m(points_m, legs).reshape(shape) - _worn_on_legs_m(hem, legs, body)
+    free_m = signed_distance_m(points_m, legs).reshape(shape) - _offset_of_legs_m(hem, legs, body)
     depth_m, lowest = _depth_m(inside, hem, body, origin_m)
     free_m = np.minimum(free_m, _beside_filmed_legs_m(inside, lowest, body, origin_m))
     value_m = np.minimum(depth_m - THICKNESS_M, free_m)
@@ -185,12 +185,12 @@ def _sampled_cavity(mesh: Mesh, hem: Hem, body: Body, bare: Body) -> Mesh | None
     return largest_component(isosurface(smooth_m, 0.0, origin_m, SPACING_M))
 
 
-def _worn_on_legs_m(hem: Hem, legs: Mesh, body: Body) -> float:
-    """Return how far the surface below the hem is from the bare legs: the median, at least 0."""
+def _offset_of_legs_m(hem: Hem, legs: Mesh, body: Body) -> float:
+    """Return how far the surface below the hem is off the bare legs, the median: negative if these are too thick."""
     height_m, top_m = hem.garment.vertices[:, 1], hem.height_m - BELOW_HEM_M
     bottom_m = max(top_m - WORN_BELOW_HEM_M, ankle_height_m(body))
     below_m = hem.garment.vertices[(height_m > bottom_m) & (height_m < top_m)]
-    return max(0.0, float(np.median(signed_distance_m(below_m, legs)))) if len(below_m) else 0.0
+    return float(np.median(signed_distance_m(below_m, legs))) if len(below_m) else 0.0
 
 
 def _beside_filmed_legs_m(

@@ -1,5 +1,6 @@
 """The inside of a captured skirt is cut out: what was closed at the hem is cloth of a known thickness, and legs."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -91,18 +92,33 @@ def test_cloth_has_a_thickness_and_its_outside_stays() -> None:
     assert np.quantile(np.abs(thickness_m - THICKNESS_M), 0.95) < 0.01
 
 
-@pytest.mark.parametrize("trousers_m", [0.0, 0.02])
-def test_legs_go_on_in_the_skirt_with_what_is_worn_below_it(trousers_m: float) -> None:
-    (solid, body), (found, _) = filmed(trousers_m), hollow(trousers_m)
+def hidden_legs(body: Body) -> np.ndarray:
+    """The vertices of legs in the skirt that are not between the thighs."""
     names = ("LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg")
     of_legs = body.skin_weights[:, [body.joint(name) for name in names]].sum(axis=1) > 0.9
     height_m = body.vertices[:, 1]
     hidden = of_legs & (np.abs(body.vertices[:, 0]) > 0.06) & (height_m > HEM_M + 0.02) & (height_m < 0.75)
     assert hidden.sum() > 100
+    return hidden
+
+
+@pytest.mark.parametrize("trousers_m", [0.0, 0.02])
+def test_legs_go_on_in_the_skirt_with_what_is_worn_below_it(trousers_m: float) -> None:
+    (solid, body), (found, _) = filmed(trousers_m), hollow(trousers_m)
+    hidden = hidden_legs(body)
     worn = body.vertices[hidden] + trousers_m * body.mesh().vertex_normals()[hidden]
     assert np.quantile(closest_points_on_mesh(worn, found)[0], 0.9) < 0.008
     # In the solid skirt these places are deep inside.
     assert np.median(signed_distance_m(worn, solid)) < -0.03
+
+
+def test_legs_that_were_fitted_too_thick_are_as_thick_as_below_the_hem() -> None:
+    solid, body = filmed()
+    thick = replace(body, vertices=(body.vertices + 0.01 * body.mesh().vertex_normals()).astype(np.float32))
+    cavity = find_cavity(solid, transfer_skin_weights(solid, body), body, thick, EDGE_M, 2000)
+    assert cavity is not None
+    at_m = closest_points_on_mesh(body.vertices[hidden_legs(body)], cut_out(solid, cavity))[0]
+    assert np.quantile(at_m, 0.9) < 0.008
 
 
 def test_both_sides_of_the_cloth_belong_together() -> None:
