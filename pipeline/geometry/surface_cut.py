@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.mesh import Mesh
 
@@ -36,6 +36,10 @@ class SurfaceCut:
         """Return values of old and new vertices, for values of the old ones."""
         new = np.einsum("nk,nkc->nc", self.weights, values[self.corners].astype(np.float64))
         return np.concatenate([values, new.astype(values.dtype)])
+
+    def extend_flags(self, flags: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, "w"]:
+        """Return flags of old and new vertices: a new one has the flag if all its corners have it."""
+        return np.concatenate([flags, flags[self.corners].all(axis=1)])
 
     def apply(self, mesh: Mesh) -> Mesh:
         """Return the mesh with its triangles split: the same surface."""

@@ -77,14 +77,13 @@ class MeshArtifact:
         dense = self.dense_skin_weights(int(self.joint_indices.max()) + 1).numpy()
         count = len(self.mesh.vertices)
         indices, weights = top_k_weights(cut.extend(dense)[count:], self.joint_indices.shape[1])
-        inside = self.is_inside
         return MeshArtifact(
             cut.apply(self.mesh),
             np.concatenate([self.joint_indices, indices.astype(self.joint_indices.dtype)]),
             np.concatenate([self.joint_weights, weights.astype(self.joint_weights.dtype)]),
             cut.extend(self.vertex_colours),
             UnsplitNormals(self.mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights),
-            is_inside=None if inside is None else np.concatenate([inside, inside[cut.corners].all(axis=1)]),
+            is_inside=None if self.is_inside is None else cut.extend_flags(self.is_inside),
         )
 
     def split(self, creases: Creases) -> "MeshArtifact":

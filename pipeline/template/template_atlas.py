@@ -96,7 +96,7 @@ def build_template_atlas(
     uv = _unfold(uv, faces_uv)
     inside = np.zeros(len(surface.faces), dtype=bool)
     if is_inside is not None:
-        inside = np.concatenate([is_inside, is_inside[cut.corners].all(axis=1)])[surface.faces].all(axis=1)
+        inside = cut.extend_flags(is_inside)[surface.faces].all(axis=1)
     loose = inside | _loose_faces(surface, uv, faces_uv, chart_of_face, size_px, inside)
     areas_m2 = surface.face_areas_m2()
     share = float(areas_m2[loose].sum() / areas_m2.sum())

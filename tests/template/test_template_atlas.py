@@ -12,7 +12,7 @@ from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.template.layout import load_layout
 from pipeline.template.regions import load_template, template_quads
 from pipeline.template.registration import register_template
-from pipeline.template.template_atlas import TemplateAtlas, build_template_atlas
+from pipeline.template.template_atlas import INSIDE_SCALE, TemplateAtlas, build_template_atlas
 from tests.template.generated_person import generated_person
 
 SIZE_PX = 512
@@ -127,3 +127,24 @@ def test_a_skirt_gets_charts_in_the_reserved_square() -> None:
     assert ((corners >= [left, bottom]) & (corners <= [right, top])).all()
     areas = signed_areas(found.atlas.uv, found.atlas.faces_uv)[~found.loose_faces]
     assert -areas[areas < 0.0].sum() < 1e-3 * areas.sum()
+
+
+@pytest.mark.slow
+def test_what_is_inside_of_a_skirt_has_small_charts_in_the_reserved_square() -> None:
+    """A band of one shin stands for the inside: it would have a place on the layout."""
+    person = generated_person(SEEDS[0])
+    registration = register_template(person.fitted, person.surface, person.landmarks())
+    at_m = person.surface.vertices
+    inside = (at_m[:, 1] > 0.25) & (at_m[:, 1] < 0.4) & (at_m[:, 0] > 0.0)
+    usual = build_template_atlas(person.surface, registration, SIZE_PX, 4)
+    found = build_template_atlas(person.surface, registration, SIZE_PX, 4, is_inside=inside)
+    surface = found.cut.apply(person.surface)
+    faces = found.cut.extend_flags(inside)[surface.faces].all(axis=1)
+    assert not usual.loose_faces[faces].all()
+    assert found.loose_faces[faces].all()
+    left, bottom, right, top = load_layout().reserved
+    corners = found.atlas.uv[found.atlas.faces_uv[faces]]
+    assert ((corners >= [left, bottom]) & (corners <= [right, top])).all()
+    per_m2 = np.abs(signed_areas(found.atlas.uv, found.atlas.faces_uv)) / surface.face_areas_m2()
+    others = found.loose_faces & ~faces
+    assert np.median(per_m2[faces]) / np.median(per_m2[others]) == pytest.approx(INSIDE_SCALE**2, rel=0.2)
