@@ -324,7 +324,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=35,
+    version=36,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

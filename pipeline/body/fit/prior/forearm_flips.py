@@ -22,7 +22,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
 CHEST, SIDES = ACTIVE_JOINTS.index("Spine2"), ("Left", "Right")
-MIN_SPREAD_RAD, MAX_SPREAD_RATIO = math.radians(25.0), 0.6
+MIN_SPREAD_RAD, MAX_SPREAD_RATIO = math.radians(25.0), 0.8
 """Angle (root mean square over the frames) about the common direction of forearms that may be mirrored, at least, and
 the part of it that is left at most if they are. The fit leads smoothly from frames that are mirrored to frames that are
 not, so those between are off by either choice. Of arms that move, mirror images take away a tenth."""
