@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import remove_unreferenced_vertices
 from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (
@@ -70,7 +71,7 @@ class Hem:
     """The hem of a skirt, or of a closed coat.
 
     height_m, top_m: heights of the hem and of the hips, between which the skirt hangs.
-    garment: the captured surface without the faces of arms, which hang beside a skirt; vertices as before.
+    garment: the captured surface without arms, which hang beside a skirt.
     """
 
     height_m: float
@@ -89,7 +90,8 @@ def find_hem(mesh: Mesh, skin_weights: Float[np.ndarray, "v j"], body: Body) -> 
     if not set(LEG_JOINTS) <= set(body.joint_names):
         return None
     on_arms = _on_arms(skin_weights, body)
-    garment, top_m = Mesh(mesh.vertices, mesh.faces[~on_arms[mesh.faces].any(axis=1)]), _top_m(body)
+    garment = remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[~on_arms[mesh.faces].any(axis=1)]))
+    top_m = _top_m(body)
     hem_m, crotch_m = (_lowest_bridge_m(surface, body, top_m) for surface in (garment, body.mesh()))
     if crotch_m - hem_m < MIN_SKIRT_M or hem_step(garment, body, hem_m, crotch_m) < MIN_HEM_STEP:
         return None
