@@ -45,9 +45,15 @@ class SkinnedTopology:
 
 def transfer_skin(mesh: Mesh, body: Body) -> SkinnedTopology:
     """Transfer the skin weights of the body to a mesh and keep four influences per vertex, as in the export."""
-    indices, kept = top_k_weights(transfer_skin_weights(mesh, body))
-    weights = dense_weights(torch.from_numpy(indices), torch.from_numpy(kept), len(body.joint_names))
-    return build_skinned_topology(mesh, weights)
+    return skin_as_exported(mesh, transfer_skin_weights(mesh, body))
+
+
+def skin_as_exported(mesh: Mesh, weights: Float[np.ndarray, "v j"]) -> SkinnedTopology:
+    """Return the topology of a mesh with four influences per vertex of its skin weights, as in the export."""
+    indices, kept = top_k_weights(weights)
+    return build_skinned_topology(
+        mesh, dense_weights(torch.from_numpy(indices), torch.from_numpy(kept), weights.shape[1])
+    )
 
 
 def build_skinned_topology(mesh: Mesh, weights: Float[Tensor, "v j"]) -> SkinnedTopology:

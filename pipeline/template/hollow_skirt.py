@@ -8,13 +8,11 @@ thickness and farther from the legs of the bare body than what is worn below the
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import dense_weights, top_k_weights
 from pipeline.geometry.surface import (
     closest_points_on_mesh,
     collapse_edges,
@@ -26,7 +24,7 @@ from pipeline.geometry.surface import (
     signed_distance_m,
     subtract,
 )
-from pipeline.mesh.skin_transfer import SkinnedTopology, build_skinned_topology, transfer_skin_weights
+from pipeline.mesh.skin_transfer import SkinnedTopology, skin_as_exported, transfer_skin_weights
 from pipeline.template.regions import outer_surface
 from pipeline.template.skirt import Hem, ankle_height_m, find_hem, leg_axis_m
 
@@ -156,9 +154,7 @@ def hollow_skin(
     weights[outside] = np.einsum("vk,vkj->vj", barycentric[outside], before[solid.faces[face[outside]]])
     lining = find_lining(mesh, is_inside)
     weights[lining.vertices] = lining.of_outer_side(weights)
-    indices, kept = top_k_weights(weights)
-    dense = dense_weights(torch.from_numpy(indices), torch.from_numpy(kept), weights.shape[1])
-    return build_skinned_topology(mesh, dense)
+    return skin_as_exported(mesh, weights)
 
 
 def _sampled_cavity(mesh: Mesh, hem: Hem, body: Body, bare: Body) -> Mesh | None:
@@ -168,13 +164,14 @@ def _sampled_cavity(mesh: Mesh, hem: Hem, body: Body, bare: Body) -> Mesh | None
     part_m = hem.garment.vertices[(height_m > bottom_m) & (height_m < hem.top_m + TOP_ABOVE_HIPS_M)]
     origin_m = part_m.min(axis=0).astype(np.float64) - 2.0 * SPACING_M
     shape = tuple(np.ceil(np.ptp(part_m, axis=0) / SPACING_M).astype(int) + 4)
-    axes = [start + SPACING_M * np.arange(count) for start, count in zip(origin_m, shape, strict=True)]
-    points_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    x_m, y_m, z_m = (start + SPACING_M * np.arange(count) for start, count in zip(origin_m, shape, strict=True))
+    points_m = np.stack(np.meshgrid(x_m, y_m, z_m, indexing="ij"), axis=-1).reshape(-1, 3)
+    axes = np.stack([_leg_axes(body, height_m, origin_m) for height_m in y_m.tolist()])
     inside = is_inside(points_m, mesh).reshape(shape)
     legs = outer_surface(bare)
     free_m = signed_distance_m(points_m, legs).reshape(shape) - _offset_of_legs_m(hem, legs, body)
-    depth_m, lowest = _depth_m(inside, hem, body, origin_m)
-    free_m = np.minimum(free_m, _beside_filmed_legs_m(inside, lowest, body, origin_m))
+    depth_m, lowest = _depth_m(inside, axes, int(np.searchsorted(y_m, hem.height_m)))
+    free_m = np.minimum(free_m, _beside_filmed_legs_m(inside, axes, lowest))
     value_m = np.minimum(depth_m - THICKNESS_M, free_m)
     cavity = _open_below(value_m > 0.0, lowest)
     if not cavity.any():
@@ -194,13 +191,14 @@ def _offset_of_legs_m(hem: Hem, legs: Mesh, body: Body) -> float:
 
 
 def _beside_filmed_legs_m(
-    inside: Bool[np.ndarray, "x y z"], lowest: int, body: Body, origin_m: Float[np.ndarray, "3"]
+    inside: Bool[np.ndarray, "x y z"], axes: Float[np.ndarray, "y 2 2"], lowest: int
 ) -> Float[np.ndarray, "x y z"]:
     """Return the horizontal distance to legs that are those of the lowest samples, and change little with the height.
 
     They may become thicker by `TAPER` up to the hem, the row `lowest`, for they are seen there, and thinner above it.
+
+    axes: of the legs in each slice, from `_leg_axes`.
     """
-    axes = [_leg_axes(body, origin_m[1] + SPACING_M * row, origin_m) for row in range(inside.shape[1])]
     filmed = _section(inside[:, 0], axes[0])
     is_left = np.arange(len(filmed))[:, None] > axes[0][:, 0].mean()
     distance_m = np.full(inside.shape, np.inf)
@@ -216,18 +214,16 @@ def _beside_filmed_legs_m(
 
 
 def _depth_m(
-    inside: Bool[np.ndarray, "x y z"], hem: Hem, body: Body, origin_m: Float[np.ndarray, "3"]
+    inside: Bool[np.ndarray, "x y z"], axes: Float[np.ndarray, "y 2 2"], start: int
 ) -> tuple[Float[np.ndarray, "x y z"], int]:
     """Return the horizontal depth below the surface of the garment, negative outside; and its lowest full section.
 
     Sections below the lowest full one have its depth.
+
+    axes: of the legs in each slice, from `_leg_axes`. start: row of the hem's lowest place.
     """
     depth_m = np.full(inside.shape, -SPACING_M)
-    heights_m = origin_m[1] + SPACING_M * np.arange(inside.shape[1])
-    sections = np.stack(
-        [_section(inside[:, row], _leg_axes(body, y, origin_m)) for row, y in enumerate(heights_m.tolist())], axis=1
-    )
-    start = int(np.searchsorted(heights_m, hem.height_m))
+    sections = np.stack([_section(inside[:, row], axis) for row, axis in enumerate(axes)], axis=1)
     areas = sections[:, start : start + round(RAGGED_M / SPACING_M) + 1].sum(axis=(0, 2))
     lowest = start + int(np.argmax(areas >= FULL_SECTION * areas.max()))
     for row in range(lowest, inside.shape[1]):
