@@ -19,7 +19,7 @@ from pipeline.body.files import (
     save_motion,
     save_scores,
 )
-from pipeline.body.filmed_legs import leg_profile, rest_with_filmed_legs
+from pipeline.body.filmed_legs import height_on_legs_m, leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.detections.hidden_legs import hidden_leg_share
 from pipeline.body.fit.diagnostics import (
@@ -114,11 +114,11 @@ def run(
     usable, training = usable_frames(result), capture.split == TRAIN
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
-    legs_as_filmed = legs.cloth_hangs_between_legs()
-    if legs_as_filmed:
+    hem = legs.hem_height()
+    if hem is not None:
         rest, bare = (rest_with_filmed_legs(body, motion, training & usable) for body in (result.body, result.bare))
-        motion = rest.motion
-        result = replace(result, body=rest.body, bare=bare.body, rotations_wxyz=motion.rotations_wxyz)
+        motion, body = rest.motion, replace(rest.body, hem_m=height_on_legs_m(rest.body, hem))
+        result = replace(result, body=body, bare=bare.body, rotations_wxyz=motion.rotations_wxyz)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_body(out / _BARE, result.bare)
@@ -159,7 +159,7 @@ def run(
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
         "frames_with_foreign_objects": int(has_foreign_object.sum()),
-        "legs_as_filmed": float(legs_as_filmed),
+        "legs_as_filmed": float(hem is not None),
         "hidden_leg_share": hidden_leg_share(capture.landmarks_visibility, capture.time_s),
     }
 
@@ -324,7 +324,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=36,
+    version=37,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -64,7 +64,7 @@ from pipeline.texture.light import VideoLight
 from pipeline.texture.lighting.shading import find_light, fit_highlights, light_metrics, light_views
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
-from pipeline.texture.unseen_sides import BodySlices, add_slice_colours, add_unseen_colours
+from pipeline.texture.unseen_sides import BodySlices, add_unseen_colours, find_slice_colours
 from pipeline.texture.vertex_texels import vertex_map, vertex_surface
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
@@ -301,18 +301,23 @@ def make_texel_inpainter(
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
-        means, weights = add_slice_colours(mesh.vertices, slices, means, weights)
+        found = find_slice_colours(mesh.vertices, slices, means, weights)
+        means, weights = add_unseen_colours(found.vertices, found.colour, means, weights)
         means, weights = add_unseen_colours(lining.vertices, lining.of_outer_side(means), means, weights)
+        before = weights
         if partner is not None:
             means, weights = add_mirrored_colours(mesh, partner, means, weights)
-        return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
+        taken = np.zeros(len(weights), dtype=bool)
+        taken[found.vertices] = weights[found.vertices] == before[found.vertices]
+        filled = texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
+        return filled + found.between_vertices(mesh.faces, texels, taken)
 
     return inpaint
 
 
 STAGE = Stage(
     "texture",
-    version=19,
+    version=20,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

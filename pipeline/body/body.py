@@ -27,7 +27,10 @@ from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
 
 @dataclass(frozen=True)
 class Body:
-    """The body of one person in the A-pose: canonical frame (+Y up, facing +Z, metres, lowest point at y = 0)."""
+    """The body of one person in the A-pose: canonical frame (+Y up, facing +Z, metres, lowest point at y = 0).
+
+    hem_m: height of the hem of a skirt or coat that hangs from leg to leg; None without one.
+    """
 
     joint_names: tuple[str, ...]
     parents: Int[np.ndarray, "j"]
@@ -36,6 +39,7 @@ class Body:
     faces: Int[np.ndarray, "f 3"]
     skin_weights: Float[np.ndarray, "v j"]
     shape: dict[str, float]
+    hem_m: float | None = None
 
     def mesh(self) -> Mesh:
         """Return the A-pose surface."""

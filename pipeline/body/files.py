@@ -15,19 +15,17 @@ from pipeline.io.npz import load_npz, save_npz
 
 def save_body(path: Path, body: Body) -> None:
     """Write the body of one person; `load_body` is the inverse."""
-    save_npz(
-        path,
-        {
-            "joint_names": np.array(body.joint_names),
-            "parents": body.parents,
-            "joints_m": body.joints_m,
-            "vertices": body.vertices,
-            "faces": body.faces,
-            "skin_weights": body.skin_weights,
-            "shape_names": np.array(list(body.shape), dtype=str),
-            "shape_values": np.array(list(body.shape.values()), dtype=np.float64),
-        },
-    )
+    arrays = {
+        "joint_names": np.array(body.joint_names),
+        "parents": body.parents,
+        "joints_m": body.joints_m,
+        "vertices": body.vertices,
+        "faces": body.faces,
+        "skin_weights": body.skin_weights,
+        "shape_names": np.array(list(body.shape), dtype=str),
+        "shape_values": np.array(list(body.shape.values()), dtype=np.float64),
+    }
+    save_npz(path, arrays if body.hem_m is None else {**arrays, "hem_m": np.array(body.hem_m)})
 
 
 def load_body(path: Path) -> Body:
@@ -46,6 +44,7 @@ def load_body(path: Path) -> Body:
         faces=arrays["faces"],
         skin_weights=arrays["skin_weights"],
         shape=dict(zip(names, arrays["shape_values"].tolist(), strict=True)),
+        hem_m=float(arrays["hem_m"]) if "hem_m" in arrays else None,
     )
 
 

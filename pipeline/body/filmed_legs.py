@@ -45,11 +45,16 @@ had trousers that grew together below it, one that was filmed with 0.05 m had no
 JUDGED_FRAMES = 24
 """Frames, evenly spaced, whose masks are compared with the legs of the body."""
 
-HEIGHTS = tuple(round(0.1 * step, 1) for step in range(1, 15))
-"""Heights that are looked at, from the hips (0) over the knees (1) down."""
+HEIGHT_STEP, HIGHEST, LOWEST = 0.025, 0.1, 1.9
+HEIGHTS = tuple(HIGHEST + HEIGHT_STEP * step for step in range(round((LOWEST - HIGHEST) / HEIGHT_STEP) + 1))
+"""Heights that are looked at, from the hips (0) over the knees (1) down, nearly to the ankles."""
 
-HEM_HEIGHT = 0.3
-"""Above it thighs touch anyway, and a hem is that of a shirt."""
+JUDGED_HEIGHTS = (0.29, 1.41)
+"""Heights that tell a skirt or coat, between these. Above, thighs touch anyway, and a hem is that of a shirt; below,
+trousers touch."""
+
+HEM_RANGE = (0.1, 0.2)
+"""Distance below a hem at which its step is measured, in the unit of `HEIGHTS`."""
 
 MIN_MARGIN_M, MIN_STEP_M = 0.02, 0.015
 """Cloth ends at a hem where its distance from the legs, left and right, is at least the first and falls by the second.
@@ -64,6 +69,9 @@ is seen between the legs below, and wherever it is. Trousers down to the floor f
 
 MIN_OPEN_SHARE = 0.5
 """Share of the pixels between the legs that show the background below a skirt."""
+
+_HEIGHTS = np.array(HEIGHTS)
+_IS_JUDGED = (JUDGED_HEIGHTS[0] < _HEIGHTS) & (JUDGED_HEIGHTS[1] > _HEIGHTS)
 
 
 @dataclass(frozen=True)
@@ -89,24 +97,45 @@ class LegProfile:
         """
         is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px <= MAX_OPEN_SHARE * self.gap_px)
         is_open = (self.gap_px >= 1.0) & (self.open_px >= MIN_OPEN_SHARE * self.gap_px)
+        is_open &= JUDGED_HEIGHTS[1] > _HEIGHTS
         is_open_below = np.append(np.maximum.accumulate(is_open[::-1])[-2::-1], False)
         is_cloth = is_covered & (is_open_below | (self.gap_px >= WIDE_GAP_PX))
-        if is_cloth[np.array(HEIGHTS) >= HEM_HEIGHT].any():
+        if is_cloth[_IS_JUDGED].any():
             return True
-        hem = self._hem()
-        if hem is None:
+        step_m = np.where(_IS_JUDGED, self._step_m(), 0.0)
+        if step_m.max() >= MIN_STEP_M:
+            hem = int(np.argmax(step_m))
+        elif (np.nan_to_num(self.margin_m)[_IS_JUDGED] >= MIN_MARGIN_M).all():
+            hem = int(np.flatnonzero(_IS_JUDGED)[-1])
+        else:
             return False
         return bool(self.open_px[:hem].sum() <= MAX_OPEN_SHARE * self.gap_px[:hem].sum())
 
-    def _hem(self) -> int | None:
-        """Return the row of `HEIGHTS` just above the hem; None without one. Cloth down to the floor ends below all."""
-        margin_m, is_judged = np.nan_to_num(self.margin_m), np.array(HEIGHTS) >= HEM_HEIGHT
-        after = np.append(margin_m, margin_m[[-1, -1]])
-        step_m = margin_m - np.minimum(after[1:-1], after[2:])
-        step_m[~is_judged | (margin_m < MIN_MARGIN_M)] = 0.0
-        if step_m.max() >= MIN_STEP_M:
-            return int(np.argmax(step_m))
-        return len(HEIGHTS) - 1 if (margin_m[is_judged] >= MIN_MARGIN_M).all() else None
+    def hem_height(self) -> float | None:
+        """Return the height of the hem of a skirt or coat, in the unit of `HEIGHTS`; None without one.
+
+        There the margin falls to half, or the background begins to be seen between the legs. Cloth down to the floor
+        ends at the lowest of the heights.
+        """
+        if not self.cloth_hangs_between_legs():
+            return None
+        step_m = self._step_m()
+        row = int(np.argmax(step_m))
+        if step_m[row] >= MIN_STEP_M:
+            below_m = np.append(np.nan_to_num(self.margin_m)[row:], 0.0)
+            below = row + int(np.argmax(below_m < below_m[0] - 0.5 * step_m[row]))
+        else:
+            is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px < MIN_OPEN_SHARE * self.gap_px)
+            below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(_HEIGHTS)
+        return float(HIGHEST + HEIGHT_STEP * (below - 0.5))
+
+    def _step_m(self) -> Float[np.ndarray, "k"]:
+        """Return how far the margin falls below each height; 0 where it is not wide enough for the cloth of a hem."""
+        margin_m = np.nan_to_num(self.margin_m)
+        near, far = (round(distance / HEIGHT_STEP) for distance in HEM_RANGE)
+        after_m = np.append(margin_m, np.full(far, margin_m[-1]))
+        step_m = margin_m - np.lib.stride_tricks.sliding_window_view(after_m[near:], far - near + 1).min(axis=1)
+        return np.where((margin_m >= MIN_MARGIN_M) & (JUDGED_HEIGHTS[0] < _HEIGHTS), step_m, 0.0)
 
 
 @dataclass(frozen=True)
@@ -178,6 +207,12 @@ def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: M
     px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
     hip_px, knee_px = px[:2].mean(), px[2:].mean()
     return [int(hip_px + height * (knee_px - hip_px)) for height in HEIGHTS]
+
+
+def height_on_legs_m(body: Body, height: float) -> float:
+    """Return a height of `HEIGHTS` on a body in its A-pose, m."""
+    hips_m, knees_m = (np.mean([body.joints_m[body.joint(side[part]), 1] for side in LEGS]) for part in (0, 1))
+    return float(hips_m + height * (knees_m - hips_m))
 
 
 def _run_length(flags: Bool[np.ndarray, "n"]) -> int:

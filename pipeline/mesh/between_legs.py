@@ -1,11 +1,9 @@
 """The space between the legs, where frames show little: strands and ridges are cleared, valleys are closed.
 
 A skirt or coat is one piece down to its hem; below it the legs are parted.
-
-Grids are samples of canonical space: origin_m is the position of sample [0, 0, 0], spacing_m the distance of
-neighbours; body_distance_m is the signed distance to the fitted body, negative inside. crotch_m is the height of its
-crotch (`crotch_height_m`).
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -29,19 +27,46 @@ LEGS = (("LeftUpLeg", "LeftLeg"), ("RightUpLeg", "RightLeg"))
 CROTCH_SHARE = 0.25
 """Distance of the crotch below the hip joints, as a share of the thigh; 0.23 to 0.28 in three fitted bodies."""
 SKIRT_RADIUS_M = 0.06
-"""Gaps in a skirt that a horizontal disc, or a ball, of this radius cannot enter are closed."""
+"""Gaps in a skirt that a horizontal disc, or a ball, of this radius cannot enter are closed. Where a gap parts the
+legs, the disc is as wide as the space between them."""
+HEM_ERROR_M = 0.02
+"""A gap that parts the legs is closed from this height above the hem on."""
 SKIRT_ABOVE_CROTCH_M = 0.2
 """A skirt or coat is closed up to this height above the crotch."""
-HEM_STEP_M, HEM_HEIGHT_M, HEM_RATIO = 0.015, 0.04, 0.5
-"""At a hem the distance from the outer sides of the legs falls by the first within the second, and to this share."""
 PARTING_M = 0.01
 """Width of the gap that parts the legs below a hem; two samples at least."""
 MIN_JOINED_M, MAX_JOINED_M = 0.03, 0.15
-"""Legs that are joined over less than the first height below the crotch of the body have no valley; cloth that joins
-them over more than the second is a skirt."""
+"""Legs that are joined over less than the first height below the crotch of the body have no valley, nor have those
+that are joined over more than the second."""
 VALLEY_HALF_WIDTH_M, VALLEY_HEIGHT_M, VALLEY_FADE_M = 0.05, 0.04, 0.04
 """Valleys are this far from the middle at most, and up to this height above the crotch of the body; beyond, the change
 fades over a distance."""
+
+
+@dataclass(frozen=True)
+class LegGrid:
+    """The fitted body on a grid of samples of canonical space.
+
+    origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbours. body_distance_m: signed distance to the
+    body, negative inside. crotch_m: height of its crotch, from `crotch_height_m`. hem_m: height of the hem of a
+    skirt or coat; None without one.
+    """
+
+    origin_m: Float[np.ndarray, "3"]
+    spacing_m: float
+    body_distance_m: Float[np.ndarray, "x y z"]
+    crotch_m: float
+    hem_m: float | None
+
+    def middle(self) -> int:
+        """Return the column of x = 0; 0 where the grid has not both legs."""
+        middle = round(-self.origin_m[0] / self.spacing_m)
+        return middle if 0 < middle < self.body_distance_m.shape[0] else 0
+
+    def row(self, height_m: float) -> int:
+        """Return the row at a height, within the grid."""
+        row = round((height_m - self.origin_m[1]) / self.spacing_m)
+        return min(max(row, 0), self.body_distance_m.shape[1])
 
 
 def crotch_height_m(body: Body) -> float:
@@ -55,42 +80,28 @@ def crotch_height_m(body: Body) -> float:
     return float(hips_m - CROTCH_SHARE * (hips_m - knees_m))
 
 
-def _middle_and_crotch(
-    shape: tuple[int, ...], crotch_m: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
-) -> tuple[int, int]:
-    """Return the column of x = 0 and the row of the crotch; 0 and 0 where the grid has not both."""
-    middle, crotch = round(-origin_m[0] / spacing_m), round((crotch_m - origin_m[1]) / spacing_m)
-    return (middle, crotch) if 0 < middle < shape[0] and 0 < crotch < shape[1] else (0, 0)
-
-
 def _leg_axes(is_leg: Bool[np.ndarray, "x z"], middle: int) -> tuple[float, float] | None:
     """Return the columns of the axes of the two legs in a slice; None where it has not both."""
     legs = [np.flatnonzero(part.any(axis=1)) for part in (is_leg[:middle], is_leg[middle:])]
     return (float(legs[0].mean()), float(legs[1].mean()) + middle) if all(len(leg) for leg in legs) else None
 
 
-def excess_between_legs(
-    inside: Bool[np.ndarray, "x y z"],
-    body_distance_m: Float[np.ndarray, "x y z"],
-    crotch_m: float,
-    origin_m: Float[np.ndarray, "3"],
-    spacing_m: float,
-) -> Bool[np.ndarray, "x y z"]:
+def excess_between_legs(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Bool[np.ndarray, "x y z"]:
     """Return the parts of the solid between the legs that are no trousers: strands and ridges.
 
     Where trousers touch each other, nothing shows the valley between them, and it is filled; the canonical pose, whose
     legs are apart, cuts the filling into a ridge on either leg and strands between them. In each horizontal slice below
-    the crotch, a piece that holds no leg and is no larger than `MAX_STRAND_AREA_M2` is a strand, and a piece that holds
-    one leg alone ends on its inner side as near to the body as on its outer side. A piece that holds both legs is a
-    skirt or coat, and stays.
+    the crotch, and the hem, a piece that holds no leg and is no larger than `MAX_STRAND_AREA_M2` is a strand, and a
+    piece that holds one leg alone ends on its inner side as near to the body as on its outer side. A piece that holds
+    both legs stays.
     """
-    excess = np.zeros_like(inside)
-    body = body_distance_m < 0.0
-    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
-    for row in range(crotch):
-        axes = _leg_axes(body[:, row], middle)
+    excess, middle = np.zeros_like(inside), grid.middle()
+    top_m = grid.crotch_m if grid.hem_m is None else min(grid.crotch_m, grid.hem_m)
+    for row in range(grid.row(top_m) if middle else 0):
+        distance_m = grid.body_distance_m[:, row]
+        axes = _leg_axes(distance_m < 0.0, middle)
         if axes is not None:
-            excess[:, row] = _excess_in_slice(inside[:, row], body_distance_m[:, row], axes, spacing_m)
+            excess[:, row] = _excess_in_slice(inside[:, row], distance_m, axes, grid.spacing_m)
     return excess
 
 
@@ -123,46 +134,41 @@ def _excess_in_slice(
     return excess
 
 
-def gaps_in_skirt(
-    inside: Bool[np.ndarray, "x y z"],
-    body_distance_m: Float[np.ndarray, "x y z"],
-    crotch_m: float,
-    origin_m: Float[np.ndarray, "3"],
-    spacing_m: float,
-) -> Bool[np.ndarray, "x y z"]:
-    """Return holes and notches of a skirt or coat: cloth that joins both legs over more than `MAX_JOINED_M`.
+def gaps_in_skirt(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Bool[np.ndarray, "x y z"]:
+    """Return holes and notches of a skirt or coat above its hem, and gaps that part it; none without a hem.
 
-    Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice from
-    `SKIRT_ABOVE_CROTCH_M` above the crotch down to the hem, or to where the legs part, the piece that holds both is
-    closed by a disc of `SKIRT_RADIUS_M`; then all slices together by a ball. Above a hem, holes may part the legs in
-    slices between others that join them; the pieces of both legs are closed there.
+    Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice up to
+    `SKIRT_ABOVE_CROTCH_M` above the crotch, the pieces that hold the legs are closed by a disc; then all slices are
+    together by a ball.
     """
-    gaps, body = np.zeros_like(inside), body_distance_m < 0.0
-    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
-    hem = hem_row(inside, body_distance_m, crotch_m, origin_m, spacing_m)
-    top = min(crotch + round(SKIRT_ABOVE_CROTCH_M / spacing_m), inside.shape[1]) if crotch else 0
-    skirt, is_joined = np.zeros_like(inside), np.zeros(inside.shape[1], dtype=bool)
-    for row in range(top - 1, hem - 1, -1):
-        labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
-        legs = np.where(body[:, row], labels, 0)
-        joined = np.intersect1d(legs[:middle], legs[middle:])
-        is_joined[row] = joined.any()
-        if not is_joined[row] and not hem:
-            break
-        held = joined if is_joined[row] else np.unique(legs)
-        skirt[:, row] = np.isin(labels, held[held > 0])
-    rows = np.flatnonzero(is_joined)
-    if spacing_m * np.count_nonzero(rows < crotch) < MAX_JOINED_M:
+    gaps, middle = np.zeros_like(inside), grid.middle()
+    if grid.hem_m is None or not middle:
         return gaps
-    part = np.s_[:, rows[0] : rows[-1] + 1]
-    closed = skirt[part].copy()
-    for row in range(closed.shape[1]):
-        closed[:, row] = closing(closed[:, row], SKIRT_RADIUS_M, spacing_m)
+    bottom, top = grid.row(grid.hem_m), grid.row(grid.crotch_m + SKIRT_ABOVE_CROTCH_M)
+    closed = np.zeros_like(inside[:, bottom:top])
+    for row in range(bottom, top):
+        labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
+        is_leg = grid.body_distance_m[:, row] < 0.0
+        legs = np.where(is_leg, labels, 0)
+        joined, radius_m = np.intersect1d(legs[:middle], legs[middle:]), SKIRT_RADIUS_M
+        if not joined.any():
+            if row < grid.row(grid.hem_m + HEM_ERROR_M):
+                continue
+            joined, radius_m = np.unique(legs), max(radius_m, grid.spacing_m * _columns_between(is_leg, middle))
+        closed[:, row - bottom] = closing(np.isin(labels, joined[joined > 0]), radius_m, grid.spacing_m)
     # Nothing is below the hem; above the top the cloth goes on.
-    reach = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
+    reach = int(np.ceil(SKIRT_RADIUS_M / grid.spacing_m)) + 1
     going_on = np.pad(closed, ((0, 0), (0, reach), (0, 0)), mode="edge")
-    gaps[part] = closing(going_on, SKIRT_RADIUS_M, spacing_m)[:, : closed.shape[1]] & ~inside[part]
+    closed = closing(going_on, SKIRT_RADIUS_M, grid.spacing_m)[:, : closed.shape[1]]
+    gaps[:, bottom:top] = closed & ~inside[:, bottom:top]
     return gaps
+
+
+def _columns_between(is_leg: Bool[np.ndarray, "x z"], middle: int) -> int:
+    """Return how many columns are between the two legs in a slice; 0 where it has not both."""
+    columns = np.flatnonzero(is_leg.any(axis=1))
+    left, right = columns[columns >= middle], columns[columns < middle]
+    return int(left.min() - right.max()) if len(left) and len(right) else 0
 
 
 def closing(solid: Bool[np.ndarray, "*n"], radius_m: float, spacing_m: float) -> Bool[np.ndarray, "*n"]:
@@ -173,72 +179,27 @@ def closing(solid: Bool[np.ndarray, "*n"], radius_m: float, spacing_m: float) ->
     return closed[(np.s_[padding:-padding],) * solid.ndim]
 
 
-def hem_row(
-    inside: Bool[np.ndarray, "x y z"],
-    body_distance_m: Float[np.ndarray, "x y z"],
-    crotch_m: float,
-    origin_m: Float[np.ndarray, "3"],
-    spacing_m: float,
-) -> int:
-    """Return the lowest row of a skirt or coat; 0 where no hem is between the crotch and the feet.
-
-    The distance of the outline from the outer sides of the legs falls there (`HEM_STEP_M`).
-    """
-    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
-    offset_m = np.array([_outer_offset_m(inside[:, row], body_distance_m[:, row], middle) for row in range(crotch)])
-    reach = max(1, round(HEM_HEIGHT_M / spacing_m))
-    if len(offset_m) <= reach:
-        return 0
-    step_m = np.nan_to_num(offset_m[reach:] - offset_m[:-reach])
-    highest = int(np.argmax(step_m))
-    if step_m[highest] < HEM_STEP_M or offset_m[highest] > HEM_RATIO * offset_m[highest + reach]:
-        return 0
-    half_m = 0.5 * (offset_m[highest] + offset_m[highest + reach])
-    return highest + int(np.argmax(offset_m[highest : highest + reach + 1] > half_m))
-
-
-def _outer_offset_m(inside: Bool[np.ndarray, "x z"], body_distance_m: Float[np.ndarray, "x z"], middle: int) -> float:
-    """Return the median distance of the outline from the outer sides of the legs in a slice; nan without two legs."""
-    axes = _leg_axes(body_distance_m < 0.0, middle)
-    if axes is None:
-        return float("nan")
-    column = np.arange(len(inside))[:, None]
-    outer = (column <= axes[0]) | (column >= axes[1])
-    outline = inside & ~ndimage.binary_erosion(inside) & outer
-    return float(np.median(body_distance_m[outline])) if outline.any() else float("nan")
-
-
-def parted_legs(
-    inside: Bool[np.ndarray, "x y z"],
-    body_distance_m: Float[np.ndarray, "x y z"],
-    crotch_m: float,
-    origin_m: Float[np.ndarray, "3"],
-    spacing_m: float,
-) -> Float[np.ndarray, "x y z"]:
+def parted_legs(grid: LegGrid) -> Float[np.ndarray, "x y z"]:
     """Return an indicator that falls from 1 to 0 in the middle between the legs below a hem; 1 elsewhere.
 
     Trousers that touch each other below a coat would grow together in its canonical pose, whose legs are the filmed
     ones. It is 0.5 at `PARTING_M` from side to side.
     """
-    indicator = np.ones(inside.shape, dtype=np.float32)
-    middle = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)[0]
-    width_m = max(PARTING_M, 2.0 * spacing_m)
-    for row in range(hem_row(inside, body_distance_m, crotch_m, origin_m, spacing_m)):
-        is_leg = body_distance_m[:, row] < 0.0
+    indicator = np.ones(grid.body_distance_m.shape, dtype=np.float32)
+    if grid.hem_m is None:
+        return indicator
+    middle, width_m = grid.middle(), max(PARTING_M, 2.0 * grid.spacing_m)
+    for row in range(grid.row(grid.hem_m)):
+        is_leg = grid.body_distance_m[:, row] < 0.0
         if is_leg[:middle].any() and is_leg[middle:].any():
             left = np.arange(len(is_leg))[:, None] >= middle
             apart_m = np.subtract(*(ndimage.distance_transform_edt(~(is_leg & side)) for side in (left, ~left)))
-            indicator[:, row] = np.minimum(np.abs(apart_m) * spacing_m / (2.0 * width_m), 1.0)
+            indicator[:, row] = np.minimum(np.abs(apart_m) * grid.spacing_m / (2.0 * width_m), 1.0)
     return indicator
 
 
-def close_valleys(
-    distance_m: Float[np.ndarray, "x y z"],
-    crotch_m: float,
-    origin_m: Float[np.ndarray, "3"],
-    spacing_m: float,
-) -> Float[np.ndarray, "x y z"]:
-    """Return a signed distance without the valleys in front of and behind the crotch.
+def close_valleys(distance_m: Float[np.ndarray, "x y z"], grid: LegGrid) -> Float[np.ndarray, "x y z"]:
+    """Return a signed distance without the valleys in front of and behind the crotch; the same with a skirt or coat.
 
     Cloth hangs from leg to leg there, and few frames show what is behind it. Each horizontal slice in which the solid
     joins both legs is closed by a disc, which does not change the outline from in front, and thighs hide it from the
@@ -246,7 +207,9 @@ def close_valleys(
 
     distance_m: of the solid, negative inside.
     """
-    middle, crotch = _middle_and_crotch(distance_m.shape, crotch_m, origin_m, spacing_m)
+    middle, crotch, spacing_m = grid.middle(), grid.row(grid.crotch_m), grid.spacing_m
+    if not middle or grid.hem_m is not None:
+        return distance_m
     is_apart = (distance_m[middle] >= 0.0).all(axis=1)[:crotch]
     lowest = int(np.flatnonzero(is_apart)[-1]) + 1 if is_apart.any() else 0
     joined_m = spacing_m * (crotch - lowest)

@@ -22,7 +22,14 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.between_legs import closing, crotch_height_m, excess_between_legs, gaps_in_skirt, parted_legs
+from pipeline.mesh.between_legs import (
+    LegGrid,
+    closing,
+    crotch_height_m,
+    excess_between_legs,
+    gaps_in_skirt,
+    parted_legs,
+)
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -46,7 +53,8 @@ class CanonicalGrid:
 
     origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
     signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
-    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere.
+    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere. hem_m:
+    height of the hem of a skirt or coat; None without one.
     ambiguous_m: empty samples above the crotch with density, which frames put there for another part of the body; see
     `pipeline.mesh.evidence`.
 
@@ -60,12 +68,17 @@ class CanonicalGrid:
     hand_weight: Float[np.ndarray, "x y z"]
     crotch_m: float
     emptiness: Float[np.ndarray, "x y z"]
+    hem_m: float | None = None
     ambiguous_m: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def downsampled(self) -> CanonicalGrid:
         """Return the grid with every second sample."""
         grids = {name: getattr(self, name)[::2, ::2, ::2] for name in _GRIDS}
         return replace(self, spacing_m=2.0 * self.spacing_m, **grids)
+
+    def legs(self) -> LegGrid:
+        """Return what tells the space between the legs."""
+        return LegGrid(self.origin_m, self.spacing_m, self.body_distance_m, self.crotch_m, self.hem_m)
 
 
 def sample_canonical_grid(
@@ -104,7 +117,7 @@ def sample_canonical_grid(
         exact = np.argwhere((hand_weight > 0.0) & narrow_band)
         distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
     crotch_m = crotch_height_m(body)
-    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight, crotch_m, emptiness)
+    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight, crotch_m, emptiness, body.hem_m)
 
 
 def _density_grid(
@@ -154,9 +167,9 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value[hands] += samples.hand_weight[hands] * (hand - value[hands])
     np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples), out=value)
     value *= 1.0 - samples.emptiness
-    legs = samples.body_distance_m, samples.crotch_m, samples.origin_m, samples.spacing_m
-    np.minimum(value, parted_legs(value >= SURFACE_ISOVALUE, *legs), out=value)
-    value[excess_between_legs(value >= SURFACE_ISOVALUE, *legs)] = 0.0
+    if samples.hem_m is not None:
+        np.minimum(value, parted_legs(samples.legs()), out=value)
+    value[excess_between_legs(value >= SURFACE_ISOVALUE, samples.legs())] = 0.0
     is_solid = value >= SURFACE_ISOVALUE
     inside = largest_solid(is_solid)
     # Filled cavities become 1; other components become empty.
@@ -262,7 +275,7 @@ def _close_concavities(
 def _close_skirt(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
     """Return an indicator in [0, 1] of the gaps in a skirt, see `gaps_in_skirt`; computed on every second sample."""
     coarse, solid = samples.downsampled(), inside[::2, ::2, ::2]
-    gaps = gaps_in_skirt(solid, coarse.body_distance_m, coarse.crotch_m, coarse.origin_m, coarse.spacing_m)
+    gaps = gaps_in_skirt(solid, coarse.legs())
     if not gaps.any():
         return np.zeros(inside.shape, dtype=np.float32)
     near = ndimage.binary_dilation(gaps, iterations=2)

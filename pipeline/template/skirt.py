@@ -1,8 +1,7 @@
 """Skirts: cloth below the crotch that bridges both legs and ends in a hem, with a ring of chains around it.
 
-A skirt is told by horizontal sections. Its surface midway between the legs is as far forward, or back, as before the
-legs' axes; and its hem is a step: the convex hull of the section is larger above it than below. Trousers of wide legs
-and a low crotch bridge as well, but their hull goes on.
+Masks tell the height of its hem (`pipeline.body.filmed_legs`). The hem is a step of the surface as well: the convex
+hull of its horizontal section is larger above it than below. That of trousers goes on.
 
 A frontal video shows no back: there the surface lies on the legs of the fitted body. The ring is closed all the same.
 
@@ -19,6 +18,7 @@ from scipy.spatial import ConvexHull
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import remove_unreferenced_vertices
+from pipeline.mesh.between_legs import crotch_height_m
 from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (
@@ -29,24 +29,20 @@ from pipeline.template.chains import (
     joint_count,
     smooth,
 )
-from pipeline.template.sections import SLICE_M, Section, cut_at_height
-
-LEG_JOINTS = tuple(side + name for side in ("Right", "Left") for name in ("Foot", "Leg", "UpLeg"))
+from pipeline.template.sections import SLICE_M, cut_at_height
 
 MIN_SKIRT_M = 0.12
 """Least length of a skirt below the crotch of the body, which most low trousers and long shirts do not reach."""
 
-BRIDGE_SHARE, FOLD_SHARE = 0.85, 0.5
-"""A section bridges the legs in front if its surface midway between them is this far forward, as a share of that before
-the legs' axes. Trousers that touch are at 0 there, a straight skirt at 1. Generated skirts: 1.05 to 1.3. Pleats of a
-real skirt have 0.69 for 5 cm: the search for the hem goes on where the share is above the second."""
+HEM_RANGE_M = 0.05
+"""The hem of the surface is up to this distance from the height that the masks tell."""
+
+MIN_HEM_STEP, HEM_STEP_M = 1.6, 0.1
+"""Least ratio of the hull's largest area above the hem to the median below it, each over this height. Generated skirts:
+3.7 and more, real ones and coats 2.5; legs and trousers: up to 1.5. A tighter skirt does not swing."""
 
 MAX_GAP_M = 0.03
-"""Sections below the second share are passed over this far: strands and holes."""
-
-MIN_HEM_STEP, HEM_BELOW_M = 1.3, 0.1
-"""Least ratio of the hull's largest area above the hem to its area below it, the median over this height. Generated
-skirts: 2.6 and more, a real one 1.7; wide trousers with a low crotch: 1.0. A skirt as tight as they does not swing."""
+"""Height over which a hem may be ragged."""
 
 SKIRT_CHAINS = 8
 
@@ -85,25 +81,26 @@ def find_hem(mesh: Mesh, skin_weights: Float[np.ndarray, "v j"], body: Body) -> 
     Args:
         mesh: the captured surface in the A-pose.
         skin_weights: of its vertices.
-        body: the fitted body in the same pose and frame.
+        body: the fitted body in the same pose and frame, with the height of the hem.
     """
-    if not set(LEG_JOINTS) <= set(body.joint_names):
+    crotch_m = crotch_height_m(body)
+    if body.hem_m is None or crotch_m - body.hem_m < MIN_SKIRT_M:
         return None
     on_arms = _on_arms(skin_weights, body)
     garment = remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[~on_arms[mesh.faces].any(axis=1)]))
-    top_m = _top_m(body)
-    hem_m, crotch_m = (_lowest_bridge_m(surface, body, top_m) for surface in (garment, body.mesh()))
-    if crotch_m - hem_m < MIN_SKIRT_M or hem_step(garment, body, hem_m, crotch_m) < MIN_HEM_STEP:
+    hem_m = _lowest_full_section_m(garment, body.hem_m)
+    if hem_step(garment, body, hem_m) < MIN_HEM_STEP:
         return None
-    return Hem(hem_m, top_m, garment)
+    return Hem(
+        hem_m, float(np.mean([body.joints_m[body.joint(side + "UpLeg"), 1] for side in ("Left", "Right")])), garment
+    )
 
 
-def hem_step(mesh: Mesh, body: Body, hem_m: float, crotch_m: float) -> float:
+def hem_step(mesh: Mesh, body: Body, hem_m: float) -> float:
     """Return how many times larger the convex hull of the surface is above the hem than below; inf on the ankles."""
-    above = [_hull_area_m2(mesh, height_m) for height_m in np.arange(hem_m, crotch_m, SLICE_M)]
-    below_m = np.arange(hem_m - HEM_BELOW_M, hem_m - MAX_GAP_M, SLICE_M)
+    below_m = np.arange(hem_m - HEM_STEP_M, hem_m - MAX_GAP_M, SLICE_M)
     below = [_hull_area_m2(mesh, height_m) for height_m in below_m[below_m > ankle_height_m(body)]]
-    return max(above, default=0.0) / float(np.median(below)) if below else np.inf
+    return _largest_hull_m2(mesh, hem_m) / float(np.median(below)) if below else np.inf
 
 
 def find_skirt(body: Body, skinned: MeshArtifact, looseness: Float[np.ndarray, "v"]) -> LoosePart | None:
@@ -182,42 +179,21 @@ def _cloth_amount(
     return amount * smooth_step(distance_m / hull_m, *_CORE) * (places[:, 0] > hem_m - MAX_GAP_M)
 
 
-def _lowest_bridge_m(mesh: Mesh, body: Body, top_m: float) -> float:
-    """Return the lowest height, from `top_m` down over folds and short gaps, at which a surface bridges both legs."""
-    lowest_m = last_m = top_m
-    for height_m in np.arange(top_m, ankle_height_m(body), -SLICE_M).tolist():
-        share = _bridge_share(cut_at_height(mesh, height_m), *leg_axis_m(body, height_m))
-        if share > BRIDGE_SHARE:
-            lowest_m = height_m
-        if share > FOLD_SHARE:
-            last_m = height_m
-        elif last_m - height_m > MAX_GAP_M:
-            break
-    return float(lowest_m)
+def _largest_hull_m2(mesh: Mesh, hem_m: float) -> float:
+    """Return the largest area of the convex hull of sections above a hem, m²."""
+    return max(_hull_area_m2(mesh, height_m) for height_m in np.arange(hem_m, hem_m + HEM_STEP_M, SLICE_M))
 
 
-def _bridge_share(section: Section, middle_m: Float[np.ndarray, "2"], half_m: Float[np.ndarray, "2"]) -> float:
-    """Return how far forward, or back, the surface between the legs is, as a share of that before the legs' axes.
-
-    -inf where there is no surface between or on the legs.
-    """
-    back_m, front_m = section.depth_range_m(float(middle_m[0]))
-    sides = [
-        (middle_m + sign * half_m, section.depth_range_m(float(middle_m[0] + sign * half_m[0]))) for sign in (-1, 1)
-    ]
-    leg_front_m = np.mean([found[1] - axis_m[1] for axis_m, found in sides])
-    leg_back_m = np.mean([axis_m[1] - found[0] for axis_m, found in sides])
-    shares = [(front_m - middle_m[1]) / leg_front_m, (middle_m[1] - back_m) / leg_back_m]
-    return float(np.nan_to_num(shares, nan=-np.inf).max())
+def _lowest_full_section_m(mesh: Mesh, told_m: float) -> float:
+    """Return the lowest height near a told one at which the convex hull is larger than half way from legs to skirt."""
+    heights_m = np.arange(told_m - HEM_RANGE_M, told_m + HEM_RANGE_M, SLICE_M)
+    areas_m2 = np.array([_hull_area_m2(mesh, height_m) for height_m in heights_m])
+    return float(heights_m[np.argmax(areas_m2 > 0.5 * (areas_m2.min() + _largest_hull_m2(mesh, told_m)))])
 
 
 def _hull_area_m2(mesh: Mesh, height_m: float) -> float:
     points_m = cut_at_height(mesh, height_m).ends_m.reshape(-1, 2)
     return float(ConvexHull(points_m).volume) if len(points_m) else 0.0  # of a plane, "volume" is the area
-
-
-def _top_m(body: Body) -> float:
-    return float(body.joints_m[[body.joint("LeftUpLeg"), body.joint("RightUpLeg")], 1].mean())
 
 
 def ankle_height_m(body: Body) -> float:

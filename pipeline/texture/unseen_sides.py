@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
+from pipeline.geometry.atlas import Texels
 from pipeline.texture.body_parts import BODY_PARTS, body_part_weights
 from pipeline.texture.inpainting import OBSERVED, SMOOTHNESS_WEIGHT
 
@@ -36,8 +37,12 @@ UNSEEN = 0.1
 HOLE_M = 0.04
 """Vertices that are nearer to one that is seen belong to a hole, which is filled from its border."""
 
-SLICE_WEIGHT = SMOOTHNESS_WEIGHT
-"""Of a slice's colour against an observed one: as much as that of a neighbour in `inpaint_vertex_colours`."""
+SLICE_WEIGHT = 10.0 * SMOOTHNESS_WEIGHT
+"""Of a slice's colour against an observed one: it outweighs the neighbours in `inpaint_vertex_colours`, for a hem
+between vertices is no mixture of both sides."""
+
+SIMILAR, SMOOTHED_SLICES = 0.15, 2
+"""Summed difference of two colours up to which slices are smoothed, with so many on either side."""
 
 HAIRLINE_DEG = 40.0
 """Slope of the hairline from the forehead down to the nape; slices of the head are parallel to it."""
@@ -54,10 +59,13 @@ _AXES = {
 
 @dataclass(frozen=True)
 class BodySlices:
-    """Part of the body (an index into `BODY_PARTS`) and slice along its axis of each vertex; -1: none, as for hands."""
+    """Where vertices are along the axes of body parts.
+
+    part: index into `BODY_PARTS`. along_m: distance along its axis from its lowest vertex; nan: none, as for hands.
+    """
 
     part: Int[np.ndarray, "v"]
-    number: Int[np.ndarray, "v"]
+    along_m: Float[np.ndarray, "v"]
 
     @classmethod
     def of_vertices(
@@ -69,7 +77,7 @@ class BodySlices:
     ) -> "BodySlices":
         """Return the slices of vertices in the A-pose, which are bound to joints of the body."""
         part = body_part_weights(joint_indices, joint_weights, body.joint_names).argmax(axis=1)
-        number = np.full(len(part), -1)
+        along_m = np.full(len(part), np.nan)
         slope = np.deg2rad(HAIRLINE_DEG)
         axes = {"head": np.array([0.0, np.cos(slope), -np.sin(slope)])}
         for name, joints in _AXES.items():
@@ -78,13 +86,95 @@ class BodySlices:
         for name, axis in axes.items():
             rows = np.flatnonzero(part == BODY_PARTS.index(name))
             if len(rows):
-                along_m = vertices_m[rows] @ axis
-                number[rows] = np.floor((along_m - along_m.min()) / SLICE_M)
-        return cls(part, number)
+                along_m[rows] = vertices_m[rows] @ axis
+                along_m[rows] -= along_m[rows].min()
+        return cls(part, along_m)
 
     def without(self, vertices: Bool[np.ndarray, "v"]) -> "BodySlices":
         """Return the slices without some vertices, such as those inside of a skirt: its outside does not tell them."""
-        return replace(self, number=np.where(vertices, -1, self.number))
+        return replace(self, along_m=np.where(vertices, np.nan, self.along_m))
+
+
+@dataclass(frozen=True)
+class SliceColours:
+    """Colours of vertices that no frame shows, and of the surface between them.
+
+    Attributes:
+        vertices: those that have the colour of their slice.
+        colour: of each of them.
+        slices: of all vertices.
+        of_part: colours of the slices of each part that has some, from the lowest one on.
+    """
+
+    vertices: Int[np.ndarray, "k"]
+    colour: Float[np.ndarray, "k 3"]
+    slices: BodySlices
+    of_part: dict[int, Float[np.ndarray, "s 3"]]
+
+    def between_vertices(
+        self, faces: Int[np.ndarray, "f 3"], texels: Texels, taken: Bool[np.ndarray, "v"]
+    ) -> Float[np.ndarray, "t 3"]:
+        """Return the difference of the texels' slices from what the vertices of their faces interpolate.
+
+        It is 0 in faces whose vertices are not all taken, and of one part.
+
+        taken: vertices that have the colour of their slice.
+        """
+        part = self.slices.part[faces]
+        is_slice = taken[faces].all(axis=1) & (part == part[:, :1]).all(axis=1)
+        rows = np.flatnonzero(is_slice[texels.face])
+        chosen = texels.select(is_slice[texels.face])
+        along_m = chosen.interpolate(faces, np.nan_to_num(self.slices.along_m)[:, None])[:, 0]
+        corner = np.zeros((len(taken), 3))
+        corner[self.vertices] = self.colour
+        difference = np.zeros((len(texels.face), 3), dtype=np.float32)
+        difference[rows] = _at(self.of_part, part[chosen.face, 0], along_m) - chosen.interpolate(faces, corner)
+        return difference
+
+
+def _at(
+    of_part: dict[int, Float[np.ndarray, "s 3"]], part: Int[np.ndarray, "n"], along_m: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the colours at places along the axes of parts, linear between the middles of slices."""
+    found = np.zeros((len(part), 3))
+    for number, colours in of_part.items():
+        rows = np.flatnonzero(part == number)
+        middles_m = SLICE_M * (np.arange(len(colours)) + 0.5)
+        found[rows] = np.stack([np.interp(along_m[rows], middles_m, channel) for channel in colours.T], axis=1)
+    return found
+
+
+def find_slice_colours(
+    vertices_m: Float[np.ndarray, "v 3"],
+    slices: BodySlices,
+    colour: Float[np.ndarray, "v 3"],
+    weight: Float[np.ndarray, "v"],
+) -> SliceColours:
+    """Find the colours that the slices of unseen vertices have where they are seen.
+
+    Vertices in holes of less than twice `HOLE_M` have none, nor have those whose slice is not seen nearby.
+
+    weight: of the observations, in [0, 1].
+    """
+    found: list[Int[np.ndarray, "k"]] = [np.zeros(0, dtype=np.int64)]
+    of_part, seen = {}, weight > OBSERVED
+    has_slice = np.isfinite(slices.along_m)
+    is_far = cKDTree(vertices_m[seen]).query(vertices_m)[0] > HOLE_M if seen.any() else ~has_slice
+    for part in range(len(BODY_PARTS)):
+        rows = (slices.part == part) & has_slice
+        unseen, known = np.flatnonzero(rows & is_far & (weight < UNSEEN)), np.flatnonzero(rows & seen)
+        if not len(unseen) or not len(known):
+            continue
+        number = np.floor(np.where(rows, slices.along_m, 0.0) / SLICE_M).astype(int)
+        distance_m = cKDTree(vertices_m[unseen]).query(vertices_m[known])[0]
+        of_slice, has_colour = _slice_colours(
+            number[known], colour[known], 1.0 / (1.0 + (distance_m / NEAR_M) ** 2) ** 2, int(number.max()) + 1
+        )
+        if has_colour.any():
+            of_part[part] = _smooth_slices(of_slice)
+            found.append(unseen[has_colour[number[unseen]]])
+    vertices = np.concatenate(found)
+    return SliceColours(vertices, _at(of_part, slices.part[vertices], slices.along_m[vertices]), slices, of_part)
 
 
 def add_unseen_colours(
@@ -99,39 +189,6 @@ def add_unseen_colours(
     """
     colour, weight, unseen = colour.copy(), weight.copy(), weight[vertices] < UNSEEN
     colour[vertices[unseen]], weight[vertices[unseen]] = of_vertices[unseen], SLICE_WEIGHT
-    return colour, weight
-
-
-def add_slice_colours(
-    vertices_m: Float[np.ndarray, "v 3"],
-    slices: BodySlices,
-    colour: Float[np.ndarray, "v 3"],
-    weight: Float[np.ndarray, "v"],
-) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v"]]:
-    """Return colours and weights in which unseen vertices have the colour that their slice has where it is seen.
-
-    Vertices in holes of less than twice `HOLE_M` are left as they are, and so are those whose slice is not seen nearby.
-
-    weight: of the observations, in [0, 1].
-    """
-    colour, weight, seen = colour.copy(), weight.copy(), weight > OBSERVED
-    if not seen.any():
-        return colour, weight
-    is_far = cKDTree(vertices_m[seen]).query(vertices_m)[0] > HOLE_M
-    for part in range(len(BODY_PARTS)):
-        rows = (slices.part == part) & (slices.number >= 0)
-        unseen, known = np.flatnonzero(rows & is_far & (weight < UNSEEN)), np.flatnonzero(rows & seen)
-        if not len(unseen) or not len(known):
-            continue
-        distance_m = cKDTree(vertices_m[unseen]).query(vertices_m[known])[0]
-        of_slice, has_colour = _slice_colours(
-            slices.number[known],
-            colour[known],
-            1.0 / (1.0 + (distance_m / NEAR_M) ** 2) ** 2,
-            int(slices.number[rows].max()) + 1,
-        )
-        taken = unseen[has_colour[slices.number[unseen]]]
-        colour[taken], weight[taken] = of_slice[slices.number[taken]], SLICE_WEIGHT
     return colour, weight
 
 
@@ -152,6 +209,16 @@ def _slice_colours(
         nearest = known[np.abs(np.arange(count)[:, None] - known).argmin(axis=1)]
         found, has_colour = found[nearest], np.abs(nearest - np.arange(count)) <= MAX_GAP_SLICES
     return found, has_colour
+
+
+def _smooth_slices(colours: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
+    """Return colours without those of single slices, and with the mean of similar ones within `SMOOTHED_SLICES`."""
+    number, even = np.arange(len(colours)), np.ones(3)
+    padded = np.pad(colours, ((1, 1), (0, 0)), mode="edge")
+    colours = np.stack([_weighted_medoid(padded[row : row + 3], even) for row in number])
+    is_near = np.abs(number[:, None] - number) <= SMOOTHED_SLICES
+    weight = is_near & (np.abs(colours[:, None] - colours).sum(axis=2) <= SIMILAR)
+    return np.asarray(weight @ colours / weight.sum(axis=1, keepdims=True))
 
 
 def _weighted_medoid(values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, "n"]) -> Float[np.ndarray, "c"]:

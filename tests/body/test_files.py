@@ -1,5 +1,7 @@
 """Artifacts of the body stage: round trips; poses that are not finite are refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,13 +22,14 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.npz import save_npz
 
 
-def test_body_round_trip(tmp_path) -> None:
+@pytest.mark.parametrize("hem_m", [None, 0.5])
+def test_body_round_trip(tmp_path, hem_m) -> None:
     parametric = load_anny()
-    body = parametric.at_shape(parametric.shape_defaults)
+    body = replace(parametric.at_shape(parametric.shape_defaults), hem_m=hem_m)
     save_body(tmp_path / "body.npz", body)
     again = load_body(tmp_path / "body.npz")
     assert again.joint_names == body.joint_names
-    assert again.shape == body.shape
+    assert (again.shape, again.hem_m) == (body.shape, body.hem_m)
     for name in ("parents", "joints_m", "vertices", "faces", "skin_weights"):
         np.testing.assert_array_equal(getattr(again, name), getattr(body, name))
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
-from pipeline.body.filmed_legs import HEIGHTS, LegProfile, leg_profile, rest_with_filmed_legs
+from pipeline.body.filmed_legs import HEIGHTS, LegProfile, height_on_legs_m, leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion
@@ -65,31 +65,45 @@ def profile_of(body: Body, mask: np.ndarray) -> LegProfile:
     return leg_profile(body, motion, CAMERA, windows, np.ones(FRAMES, dtype=bool))
 
 
+def hem_of(profile: LegProfile, body: Body) -> float:
+    """Height of the hem, m; nan without one."""
+    height = profile.hem_height()
+    return float("nan") if height is None else height_on_legs_m(body, height)
+
+
 def test_bare_legs_and_trousers_hang_apart(body: Body) -> None:
     profile = profile_of(body, silhouette(body))
     assert np.nanmax(profile.margin_m) < 0.01
     assert profile.open_px.sum() > 0.9 * profile.gap_px.sum() > 0.0
-    assert not profile.cloth_hangs_between_legs()
+    assert profile.hem_height() is None
     assert not profile_of(body, dressed(body, 0.1, 2, False)).cloth_hangs_between_legs()
 
 
 def test_a_skirt_ends_at_its_hem(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.6, 12, True))
-    assert profile.cloth_hangs_between_legs()
+    assert hem_of(profile, body) == pytest.approx(0.6, abs=0.01)
     knee_m, hip_m = (body.joints_m[body.joint(name), 1] for name in ("LeftLeg", "LeftUpLeg"))
-    above = np.array(HEIGHTS) < (hip_m - 0.6) / (hip_m - knee_m) - 0.1
-    assert np.nanmin(profile.margin_m[above][3:]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
+    heights = np.array(HEIGHTS)
+    above = (heights > 0.35) & (heights < (hip_m - 0.6) / (hip_m - knee_m) - 0.1)
+    assert np.nanmin(profile.margin_m[above]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
 
 
 def test_a_close_skirt_covers_the_gap(body: Body) -> None:
     """Its hem is no step: the fitted hips are as wide as the skirt."""
     profile = profile_of(body, dressed(body, 0.6, 2, True))
     assert np.nanmax(profile.margin_m) < 0.02
-    assert profile.cloth_hangs_between_legs()
+    assert hem_of(profile, body) == pytest.approx(0.6, abs=0.01)
 
 
-def test_cloth_down_to_the_floor_has_no_hem(body: Body) -> None:
-    assert profile_of(body, dressed(body, 0.05, 14, True)).cloth_hangs_between_legs()
+@pytest.mark.parametrize("hem_m", [0.45, 0.3, 0.2])
+def test_long_skirts_end_at_their_hems(body: Body, hem_m: float) -> None:
+    """The last is below all heights that tell a skirt."""
+    assert hem_of(profile_of(body, dressed(body, hem_m, 14, True)), body) == pytest.approx(hem_m, abs=0.015)
+
+
+def test_cloth_down_to_the_floor_ends_at_the_lowest_height(body: Body) -> None:
+    profile = profile_of(body, dressed(body, 0.05, 14, True))
+    assert hem_of(profile, body) == pytest.approx(height_on_legs_m(body, HEIGHTS[-1]), abs=0.01)
 
 
 def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:

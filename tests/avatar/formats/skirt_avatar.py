@@ -1,5 +1,6 @@
 """A generated person with a skirt as an exported avatar, and what its surface is known to be."""
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -34,10 +35,12 @@ def _person(seed: int, legwear: str, flare_m: float) -> tuple[Subject, Body]:
 
 
 def clothed(seed: int, legwear: str, flare_m: float) -> tuple[MeshArtifact, Body]:
-    """The surface of a generated person with its skin, and the body without clothes."""
+    """The surface of a generated person with its skin, and the body without clothes; its hem is told 2 cm too low."""
     subject, bare = _person(seed, legwear, flare_m)
     person = subject.body
     colours = np.full((len(person.vertices), 3), 0.5, np.float32)
+    if legwear == "skirt":
+        bare = replace(bare, hem_m=float(person.vertices[-SKIRT_VERTICES:, 1].min()) - 0.02)
     return MeshArtifact(Mesh(person.vertices, person.faces), *top_k_weights(person.skin_weights), colours), bare
 
 
