@@ -41,8 +41,9 @@ SLICE_WEIGHT = 10.0 * SMOOTHNESS_WEIGHT
 """Of a slice's colour against an observed one: it outweighs the neighbours in `inpaint_vertex_colours`, for a hem
 between vertices is no mixture of both sides."""
 
-SIMILAR, SMOOTHED_SLICES = 0.15, 2
-"""Summed difference of two colours up to which slices are smoothed, with so many on either side."""
+SMOOTHED_SLICES, SMOOTHED_DIFFERENCE, SMOOTHINGS = 3.0, 0.18, 5
+"""Standard deviations, in slices and in summed differences of two colours, of a bilateral filter, and how often it is
+applied. Light and folds differ by up to 0.35 from slice to slice, shirts from trousers by 0.5 and more."""
 
 HAIRLINE_DEG = 40.0
 """Slope of the hairline from the forehead down to the nape; slices of the head are parallel to it."""
@@ -212,13 +213,19 @@ def _slice_colours(
 
 
 def _smooth_slices(colours: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "s 3"]:
-    """Return colours without those of single slices, and with the mean of similar ones within `SMOOTHED_SLICES`."""
+    """Return the colours without those of single slices, smooth but for borders.
+
+    The filter: Tomasi and Manduchi, "Bilateral filtering for gray and color images", 1998.
+    """
     number, even = np.arange(len(colours)), np.ones(3)
     padded = np.pad(colours, ((1, 1), (0, 0)), mode="edge")
     colours = np.stack([_weighted_medoid(padded[row : row + 3], even) for row in number])
-    is_near = np.abs(number[:, None] - number) <= SMOOTHED_SLICES
-    weight = is_near & (np.abs(colours[:, None] - colours).sum(axis=2) <= SIMILAR)
-    return np.asarray(weight @ colours / weight.sum(axis=1, keepdims=True))
+    near = np.exp(-0.5 * ((number[:, None] - number) / SMOOTHED_SLICES) ** 2)
+    for _ in range(SMOOTHINGS):
+        difference = np.abs(colours[:, None] - colours).sum(axis=2)
+        weight = near * np.exp(-0.5 * (difference / SMOOTHED_DIFFERENCE) ** 2)
+        colours = weight @ colours / weight.sum(axis=1, keepdims=True)
+    return np.asarray(colours)
 
 
 def _weighted_medoid(values: Float[np.ndarray, "n c"], weight: Float[np.ndarray, "n"]) -> Float[np.ndarray, "c"]:
