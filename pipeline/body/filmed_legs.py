@@ -46,12 +46,11 @@ JUDGED_FRAMES = 24
 """Frames, evenly spaced, whose masks are compared with the legs of the body."""
 
 HEIGHT_STEP, HIGHEST, LOWEST = 0.025, 0.1, 1.9
-HEIGHTS = tuple(HIGHEST + HEIGHT_STEP * step for step in range(round((LOWEST - HIGHEST) / HEIGHT_STEP) + 1))
+HEIGHTS = HIGHEST + HEIGHT_STEP * np.arange(round((LOWEST - HIGHEST) / HEIGHT_STEP) + 1)
 """Heights that are looked at, from the hips (0) over the knees (1) down, nearly to the ankles."""
 
-JUDGED_HEIGHTS = (0.29, 1.41)
-"""Heights that tell a skirt or coat, between these. Above, thighs touch anyway, and a hem is that of a shirt; below,
-trousers touch."""
+JUDGED_FROM, JUDGED_TO = 0.29, 1.41
+"""Heights that tell a skirt. Above, thighs touch anyway, and a hem is that of a shirt; below, trousers touch."""
 
 HEM_RANGE = (0.1, 0.2)
 """Distance below a hem at which its step is measured, in the unit of `HEIGHTS`."""
@@ -70,8 +69,7 @@ is seen between the legs below, and wherever it is. Trousers down to the floor f
 MIN_OPEN_SHARE = 0.5
 """Share of the pixels between the legs that show the background below a skirt."""
 
-_HEIGHTS = np.array(HEIGHTS)
-_IS_JUDGED = (JUDGED_HEIGHTS[0] < _HEIGHTS) & (JUDGED_HEIGHTS[1] > _HEIGHTS)
+_IS_JUDGED = (HEIGHTS > JUDGED_FROM) & (HEIGHTS < JUDGED_TO)
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class LegProfile:
         """
         is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px <= MAX_OPEN_SHARE * self.gap_px)
         is_open = (self.gap_px >= 1.0) & (self.open_px >= MIN_OPEN_SHARE * self.gap_px)
-        is_open &= JUDGED_HEIGHTS[1] > _HEIGHTS
+        is_open &= HEIGHTS < JUDGED_TO
         is_open_below = np.append(np.maximum.accumulate(is_open[::-1])[-2::-1], False)
         is_cloth = is_covered & (is_open_below | (self.gap_px >= WIDE_GAP_PX))
         if is_cloth[_IS_JUDGED].any():
@@ -126,7 +124,7 @@ class LegProfile:
             below = row + int(np.argmax(below_m < below_m[0] - 0.5 * step_m[row]))
         else:
             is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px < MIN_OPEN_SHARE * self.gap_px)
-            below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(_HEIGHTS)
+            below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(HEIGHTS)
         return float(HIGHEST + HEIGHT_STEP * (below - 0.5))
 
     def _step_m(self) -> Float[np.ndarray, "k"]:
@@ -135,7 +133,7 @@ class LegProfile:
         near, far = (round(distance / HEIGHT_STEP) for distance in HEM_RANGE)
         after_m = np.append(margin_m, np.full(far, margin_m[-1]))
         step_m = margin_m - np.lib.stride_tricks.sliding_window_view(after_m[near:], far - near + 1).min(axis=1)
-        return np.where((margin_m >= MIN_MARGIN_M) & (JUDGED_HEIGHTS[0] < _HEIGHTS), step_m, 0.0)
+        return np.where((margin_m >= MIN_MARGIN_M) & (HEIGHTS > JUDGED_FROM), step_m, 0.0)
 
 
 @dataclass(frozen=True)

@@ -83,8 +83,8 @@ def test_a_skirt_ends_at_its_hem(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.6, 12, True))
     assert hem_of(profile, body) == pytest.approx(0.6, abs=0.01)
     knee_m, hip_m = (body.joints_m[body.joint(name), 1] for name in ("LeftLeg", "LeftUpLeg"))
-    heights = np.array(HEIGHTS)
-    above = (heights > 0.35) & (heights < (hip_m - 0.6) / (hip_m - knee_m) - 0.1)
+    hem = (hip_m - 0.6) / (hip_m - knee_m)
+    above = (HEIGHTS > 0.35) & (hem - 0.1 > HEIGHTS)
     assert np.nanmin(profile.margin_m[above]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
 
 
@@ -103,7 +103,7 @@ def test_long_skirts_end_at_their_hems(body: Body, hem_m: float) -> None:
 
 def test_cloth_down_to_the_floor_ends_at_the_lowest_height(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.05, 14, True))
-    assert hem_of(profile, body) == pytest.approx(height_on_legs_m(body, HEIGHTS[-1]), abs=0.01)
+    assert hem_of(profile, body) == pytest.approx(height_on_legs_m(body, float(HEIGHTS[-1])), abs=0.01)
 
 
 def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:
@@ -116,7 +116,7 @@ def test_a_long_shirt_ends_above_the_legs(body: Body) -> None:
 
 def test_trousers_that_touch_each_other_down_to_the_floor_are_no_skirt() -> None:
     """Shins stand 3 cm from each other. Where the background is seen below, or they stand farther apart, it is one."""
-    margin_m, rows = np.full(len(HEIGHTS), 0.004), np.array(HEIGHTS)
+    margin_m, rows = np.full(len(HEIGHTS), 0.004), HEIGHTS
     narrow_px, covered = np.interp(rows, (0.7, 1.2), (0.0, 4.5)), np.zeros(len(rows))
     assert not LegProfile(margin_m, narrow_px, covered).cloth_hangs_between_legs()
     assert LegProfile(margin_m, 2.0 * narrow_px, covered).cloth_hangs_between_legs()
