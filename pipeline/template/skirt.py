@@ -31,8 +31,8 @@ from pipeline.template.chains import (
 )
 from pipeline.template.sections import SLICE_M, cut_at_height
 
-MIN_SKIRT_M = 0.12
-"""Least length of a skirt below the crotch of the body, which most low trousers and long shirts do not reach."""
+MIN_SKIRT_M = 0.06
+"""Least length of a skirt below the crotch of the body, which most long shirts do not reach."""
 
 HEM_RANGE_M = 0.05
 """The hem of the surface is up to this distance from the height that the masks tell."""

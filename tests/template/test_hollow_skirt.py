@@ -34,10 +34,10 @@ def radius_m(height_m: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=3)
-def filmed(trousers_m: float = 0.0, has_skirt: bool = True) -> tuple[Mesh, Body]:
+def filmed(trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M) -> tuple[Mesh, Body]:
     """What frames show of a person: a skirt that is solid down to its hem, and legs in trousers of a thickness."""
     model = load_anny()
-    body = replace(model.at_shape(model.shape_defaults), hem_m=HEM_M if has_skirt else None)
+    body = replace(model.at_shape(model.shape_defaults), hem_m=hem_m if has_skirt else None)
     low, high = body.vertices.min(axis=0) - 0.05, body.vertices.max(axis=0) + 0.05
     low[2], high[2] = hips_z_m(body) - 1.1 * HEM_RADIUS_M, hips_z_m(body) + 1.1 * HEM_RADIUS_M
     axes = [np.arange(first, last, SPACING_M) for first, last in zip(low, high, strict=True)]
@@ -47,7 +47,7 @@ def filmed(trousers_m: float = 0.0, has_skirt: bool = True) -> tuple[Mesh, Body]
     distance_m -= trousers_m * ((y > 0.15) & (y < WAIST_M))
     if has_skirt:
         cone_m = np.hypot(x, z - hips_z_m(body)) - radius_m(y)
-        distance_m = np.minimum(distance_m, np.maximum(cone_m, np.maximum(HEM_M - y, y - WAIST_M)))
+        distance_m = np.minimum(distance_m, np.maximum(cone_m, np.maximum(hem_m - y, y - WAIST_M)))
     return largest_component(isosurface(-distance_m, 0.0, low, SPACING_M)), body
 
 
@@ -131,6 +131,18 @@ def test_both_sides_of_the_cloth_belong_together() -> None:
     legs = np.setdiff1d(np.flatnonzero(inside), lining.vertices)
     near_axis = np.abs(np.abs(found.vertices[legs, 0]) - 0.1) < 0.1
     assert (near_axis & (found.vertices[legs, 1] < 0.7)).sum() > 20
+
+
+@pytest.mark.parametrize("hem_m", [0.78, 0.25])
+def test_short_and_long_skirts_are_hollow(hem_m: float) -> None:
+    """A hand below the crotch, and over the ankles."""
+    solid, body = filmed(hem_m=hem_m)
+    cavity = find_cavity(solid, transfer_skin_weights(solid, body), body, body, EDGE_M, 2000)
+    assert cavity is not None
+    height_m = np.linspace(hem_m + 0.01, hem_m + 0.04, 4)
+    beside_cloth = np.stack([0.0 * height_m, height_m, hips_z_m(body) + radius_m(height_m) - 0.03], axis=1)
+    assert is_inside(beside_cloth, solid).all()
+    assert not is_inside(beside_cloth, cut_out(solid, cavity)).any()
 
 
 def test_a_person_without_a_skirt_stays_as_filmed() -> None:
