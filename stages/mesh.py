@@ -382,7 +382,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=48,
+    version=49,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

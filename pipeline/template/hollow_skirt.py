@@ -183,10 +183,15 @@ def _sampled_cavity(mesh: Mesh, hem: Hem, body: Body, bare: Body) -> Mesh | None
 
 
 def _offset_of_legs_m(hem: Hem, legs: Mesh, body: Body) -> float:
-    """Return how far the surface below the hem is off the bare legs, the median: negative if these are too thick."""
+    """Return how far the surface below the hem is off the bare legs: negative if these are too thick.
+
+    It is the median over the outer sides: the inner ones of legs that stand side by side are hardly seen.
+    """
     height_m, top_m = hem.garment.vertices[:, 1], hem.height_m - BELOW_HEM_M
     bottom_m = max(top_m - WORN_BELOW_HEM_M, ankle_height_m(body))
     below_m = hem.garment.vertices[(height_m > bottom_m) & (height_m < top_m)]
+    (middle_m, _), (half_m, _) = leg_axis_m(body, 0.5 * (bottom_m + top_m))
+    below_m = below_m[np.abs(below_m[:, 0] - middle_m) > half_m]
     return float(np.median(signed_distance_m(below_m, legs))) if len(below_m) else 0.0
 
 

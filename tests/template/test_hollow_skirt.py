@@ -34,8 +34,13 @@ def radius_m(height_m: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=3)
-def filmed(trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M) -> tuple[Mesh, Body]:
-    """What frames show of a person: a skirt that is solid down to its hem, and legs in trousers of a thickness."""
+def filmed(
+    trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M, inner_m: float = 0.0
+) -> tuple[Mesh, Body]:
+    """What frames show of a person: a skirt that is solid down to its hem, and legs in trousers of a thickness.
+
+    inner_m: by how much these are thicker between the legs.
+    """
     model = load_anny()
     body = replace(model.at_shape(model.shape_defaults), hem_m=hem_m if has_skirt else None)
     low, high = body.vertices.min(axis=0) - 0.05, body.vertices.max(axis=0) + 0.05
@@ -44,11 +49,18 @@ def filmed(trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M
     x, y, z = np.meshgrid(*axes, indexing="ij")
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     distance_m = signed_distance_m(points, outer_surface(body)).reshape(x.shape)
-    distance_m -= trousers_m * ((y > 0.15) & (y < WAIST_M))
+    between = np.clip((leg_x_m(body, y) - np.abs(x)) / 0.03, 0.0, 1.0)
+    distance_m -= (trousers_m + inner_m * between) * ((y > 0.15) & (y < WAIST_M))
     if has_skirt:
         cone_m = np.hypot(x, z - hips_z_m(body)) - radius_m(y)
         distance_m = np.minimum(distance_m, np.maximum(cone_m, np.maximum(hem_m - y, y - WAIST_M)))
     return largest_component(isosurface(-distance_m, 0.0, low, SPACING_M)), body
+
+
+def leg_x_m(body: Body, height_m: np.ndarray) -> np.ndarray:
+    """Distance of the axes of the legs from the middle."""
+    ankle_m, knee_m, hip_m = (body.joints_m[body.joint(name)] for name in ("LeftFoot", "LeftLeg", "LeftUpLeg"))
+    return np.interp(height_m, *np.stack([ankle_m, knee_m, hip_m])[:, [1, 0]].T)
 
 
 def hips_z_m(body: Body) -> float:
@@ -119,6 +131,16 @@ def test_legs_that_were_fitted_too_thick_are_as_thick_as_below_the_hem() -> None
     assert cavity is not None
     at_m = closest_points_on_mesh(body.vertices[hidden_legs(body)], cut_out(solid, cavity))[0]
     assert np.quantile(at_m, 0.9) < 0.008
+
+
+def test_the_outer_sides_of_legs_tell_what_is_worn() -> None:
+    """What fills the gap between legs that stand side by side is no trousers."""
+    solid, body = filmed(inner_m=0.03)
+    cavity = find_cavity(solid, transfer_skin_weights(solid, body), body, body, EDGE_M, 2000)
+    assert cavity is not None
+    legs = body.vertices[hidden_legs(body)]
+    outer = legs[np.abs(legs[:, 0]) > leg_x_m(body, legs[:, 1]) + 0.02]
+    assert np.quantile(closest_points_on_mesh(outer, cut_out(solid, cavity))[0], 0.9) < 0.006
 
 
 def test_both_sides_of_the_cloth_belong_together() -> None:
