@@ -155,7 +155,7 @@ def test_both_sides_of_the_cloth_belong_together() -> None:
     assert (near_axis & (found.vertices[legs, 1] < 0.7)).sum() > 20
 
 
-@pytest.mark.parametrize("hem_m", [0.78, 0.25])
+@pytest.mark.parametrize("hem_m", [0.78, pytest.param(0.25, marks=pytest.mark.slow)])
 def test_short_and_long_skirts_are_hollow(hem_m: float) -> None:
     """A hand below the crotch, and over the ankles."""
     solid, body = filmed(hem_m=hem_m)
