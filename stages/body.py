@@ -19,7 +19,7 @@ from pipeline.body.files import (
     save_motion,
     save_scores,
 )
-from pipeline.body.filmed_legs import height_on_legs_m, leg_profile, rest_with_filmed_legs
+from pipeline.body.filmed_legs import leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.detections.hidden_legs import hidden_leg_share
 from pipeline.body.fit.diagnostics import (
@@ -117,7 +117,7 @@ def run(
     hem = legs.hem_height()
     if hem is not None:
         rest, bare = (rest_with_filmed_legs(body, motion, training & usable) for body in (result.body, result.bare))
-        motion, body = rest.motion, replace(rest.body, hem_m=height_on_legs_m(rest.body, hem))
+        motion, body = rest.motion, replace(rest.body, hem_m=rest.body.height_on_legs_m(hem))
         result = replace(result, body=body, bare=bare.body, rotations_wxyz=motion.rotations_wxyz)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)

@@ -57,6 +57,14 @@ class Body:
         """Return the height of the A-pose, from sole to crown."""
         return float(np.ptp(self.vertices[:, 1]))
 
+    def height_on_legs_m(self, share: float) -> float:
+        """Return a height on both legs in the A-pose: 0 at the hips, 1 at the knees, more below them."""
+        hips_m, knees_m = (
+            np.mean([self.joints_m[self.joint(side + name), 1] for side in ("Left", "Right")])
+            for name in ("UpLeg", "Leg")
+        )
+        return float(hips_m + share * (knees_m - hips_m))
+
 
 @dataclass(frozen=True)
 class Motion:

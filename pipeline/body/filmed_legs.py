@@ -47,7 +47,7 @@ JUDGED_FRAMES = 24
 
 HEIGHT_STEP, HIGHEST, LOWEST = 0.025, 0.1, 1.9
 HEIGHTS = HIGHEST + HEIGHT_STEP * np.arange(round((LOWEST - HIGHEST) / HEIGHT_STEP) + 1)
-"""Heights that are looked at, from the hips (0) over the knees (1) down, nearly to the ankles."""
+"""Heights that are looked at, as of `Body.height_on_legs_m`, nearly to the ankles."""
 
 JUDGED_FROM, JUDGED_TO = 0.29, 1.41
 """Heights that tell a skirt. Above, thighs touch anyway, and a hem is that of a shirt; below, trousers touch."""
@@ -205,12 +205,6 @@ def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: M
     px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
     hip_px, knee_px = px[:2].mean(), px[2:].mean()
     return [int(hip_px + height * (knee_px - hip_px)) for height in HEIGHTS]
-
-
-def height_on_legs_m(body: Body, height: float) -> float:
-    """Return a height of `HEIGHTS` on a body in its A-pose, m."""
-    hips_m, knees_m = (np.mean([body.joints_m[body.joint(side[part]), 1] for side in LEGS]) for part in (0, 1))
-    return float(hips_m + height * (knees_m - hips_m))
 
 
 def _run_length(flags: Bool[np.ndarray, "n"]) -> int:

@@ -76,8 +76,7 @@ def crotch_height_m(body: Body) -> float:
     """
     if not {joint for leg in LEGS for joint in leg} <= set(body.joint_names):
         return float(body.vertices[:, 1].min())
-    hips_m, knees_m = (np.mean([body.joints_m[body.joint(leg[part]), 1] for leg in LEGS]) for part in (0, 1))
-    return float(hips_m - CROTCH_SHARE * (hips_m - knees_m))
+    return body.height_on_legs_m(CROTCH_SHARE)
 
 
 def _leg_axes(is_leg: Bool[np.ndarray, "x z"], middle: int) -> tuple[float, float] | None:
@@ -138,24 +137,24 @@ def gaps_in_skirt(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Bool[np.n
     """Return holes and notches of a skirt or coat above its hem, and gaps that part it; none without a hem.
 
     Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice up to
-    `SKIRT_ABOVE_CROTCH_M` above the crotch, the pieces that hold the legs are closed by a disc; then all slices are
+    `SKIRT_ABOVE_CROTCH_M` above the crotch, the pieces that hold the legs are closed by a disc; then all slices
     together by a ball.
     """
     gaps, middle = np.zeros_like(inside), grid.middle()
     if grid.hem_m is None or not middle:
         return gaps
     bottom, top = grid.row(grid.hem_m), grid.row(grid.crotch_m + SKIRT_ABOVE_CROTCH_M)
-    closed = np.zeros_like(inside[:, bottom:top])
+    parted_from, closed = grid.row(grid.hem_m + HEM_ERROR_M), np.zeros_like(inside[:, bottom:top])
     for row in range(bottom, top):
         labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
         is_leg = grid.body_distance_m[:, row] < 0.0
         legs = np.where(is_leg, labels, 0)
-        joined, radius_m = np.intersect1d(legs[:middle], legs[middle:]), SKIRT_RADIUS_M
-        if not joined.any():
-            if row < grid.row(grid.hem_m + HEM_ERROR_M):
+        held, radius_m = np.intersect1d(legs[:middle], legs[middle:]), SKIRT_RADIUS_M
+        if not held.any():
+            if row < parted_from:
                 continue
-            joined, radius_m = np.unique(legs), max(radius_m, grid.spacing_m * _columns_between(is_leg, middle))
-        closed[:, row - bottom] = closing(np.isin(labels, joined[joined > 0]), radius_m, grid.spacing_m)
+            held, radius_m = np.unique(legs), max(radius_m, grid.spacing_m * _columns_between(is_leg, middle))
+        closed[:, row - bottom] = closing(np.isin(labels, held[held > 0]), radius_m, grid.spacing_m)
     # Nothing is below the hem; above the top the cloth goes on.
     reach = int(np.ceil(SKIRT_RADIUS_M / grid.spacing_m)) + 1
     going_on = np.pad(closed, ((0, 0), (0, reach), (0, 0)), mode="edge")

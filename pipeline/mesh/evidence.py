@@ -194,7 +194,7 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     """
     coarse = samples.downsampled()
     solid = (coarse.density > MIN_DENSITY_PER_M) | (coarse.body_distance_m < 0.0)
-    solid |= gaps_in_skirt(solid, coarse.legs())
+    solid |= gaps_in_skirt(solid, coarse)
     candidates = ndimage.binary_dilation(solid) & (coarse.body_distance_m > CLOSE_TO_BODY_M)
     points_m = np.argwhere(candidates) * coarse.spacing_m + coarse.origin_m
     is_empty = np.zeros(candidates.shape, dtype=bool)

@@ -104,7 +104,7 @@ def fair_surface(
     value_m = upsample(offset_m, shape)
     value_m *= 1.0 - samples.hand_weight
     value_m += upsample(reference_m, shape)
-    value_m = close_valleys(value_m, samples.legs())
+    value_m = close_valleys(value_m, samples)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
     share = fine_detail[near_detail]

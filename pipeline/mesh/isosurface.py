@@ -48,37 +48,26 @@ _GRIDS = ("density", "body_distance_m", "hand_weight", "emptiness")
 
 
 @dataclass(frozen=True)
-class CanonicalGrid:
-    """Density and signed distance on a regular grid in canonical space.
+class CanonicalGrid(LegGrid):
+    """Density beside the signed distance to the body on a regular grid in canonical space.
 
-    origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
-    signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
-    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere. hem_m:
-    height of the hem of a skirt or coat; None without one.
+    density: 1/m. hand_weight: skin weight of the hand joints, in [0, 1]. emptiness: 1 where nothing is whatever the
+    density, 0 elsewhere.
     ambiguous_m: empty samples above the crotch with density, which frames put there for another part of the body; see
     `pipeline.mesh.evidence`.
 
     Weight and emptiness are kept in half precision, because a fine grid has 25 million samples.
     """
 
-    origin_m: Float[np.ndarray, "3"]
-    spacing_m: float
     density: Float[np.ndarray, "x y z"]
-    body_distance_m: Float[np.ndarray, "x y z"]
     hand_weight: Float[np.ndarray, "x y z"]
-    crotch_m: float
     emptiness: Float[np.ndarray, "x y z"]
-    hem_m: float | None = None
     ambiguous_m: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def downsampled(self) -> CanonicalGrid:
         """Return the grid with every second sample."""
         grids = {name: getattr(self, name)[::2, ::2, ::2] for name in _GRIDS}
         return replace(self, spacing_m=2.0 * self.spacing_m, **grids)
-
-    def legs(self) -> LegGrid:
-        """Return what tells the space between the legs."""
-        return LegGrid(self.origin_m, self.spacing_m, self.body_distance_m, self.crotch_m, self.hem_m)
 
 
 def sample_canonical_grid(
@@ -116,8 +105,9 @@ def sample_canonical_grid(
         narrow_band = np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * voxel_size_m
         exact = np.argwhere((hand_weight > 0.0) & narrow_band)
         distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
-    crotch_m = crotch_height_m(body)
-    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight, crotch_m, emptiness, body.hem_m)
+    return CanonicalGrid(
+        origin_m, voxel_size_m, distance_m, crotch_height_m(body), body.hem_m, density, hand_weight, emptiness
+    )
 
 
 def _density_grid(
@@ -167,9 +157,8 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value[hands] += samples.hand_weight[hands] * (hand - value[hands])
     np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples), out=value)
     value *= 1.0 - samples.emptiness
-    if samples.hem_m is not None:
-        np.minimum(value, parted_legs(samples.legs()), out=value)
-    value[excess_between_legs(value >= SURFACE_ISOVALUE, samples.legs())] = 0.0
+    np.minimum(value, parted_legs(samples), out=value)
+    value[excess_between_legs(value >= SURFACE_ISOVALUE, samples)] = 0.0
     is_solid = value >= SURFACE_ISOVALUE
     inside = largest_solid(is_solid)
     # Filled cavities become 1; other components become empty.
@@ -275,7 +264,7 @@ def _close_concavities(
 def _close_skirt(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
     """Return an indicator in [0, 1] of the gaps in a skirt, see `gaps_in_skirt`; computed on every second sample."""
     coarse, solid = samples.downsampled(), inside[::2, ::2, ::2]
-    gaps = gaps_in_skirt(solid, coarse.legs())
+    gaps = gaps_in_skirt(solid, coarse)
     if not gaps.any():
         return np.zeros(inside.shape, dtype=np.float32)
     near = ndimage.binary_dilation(gaps, iterations=2)

@@ -91,7 +91,7 @@ def find_hem(mesh: Mesh, skin_weights: Float[np.ndarray, "v j"], body: Body) -> 
     hem_m = _lowest_full_section_m(garment, body.hem_m)
     if hem_step(garment, body, hem_m) < MIN_HEM_STEP:
         return None
-    return Hem(hem_m, _hip_height_m(body), garment)
+    return Hem(hem_m, body.height_on_legs_m(0.0), garment)
 
 
 def hem_step(mesh: Mesh, body: Body, hem_m: float) -> float:
@@ -192,10 +192,6 @@ def _lowest_full_section_m(mesh: Mesh, told_m: float) -> float:
 def _hull_area_m2(mesh: Mesh, height_m: float) -> float:
     points_m = cut_at_height(mesh, height_m).ends_m.reshape(-1, 2)
     return float(ConvexHull(points_m).volume) if len(points_m) else 0.0  # of a plane, "volume" is the area
-
-
-def _hip_height_m(body: Body) -> float:
-    return float(body.joints_m[[body.joint("LeftUpLeg"), body.joint("RightUpLeg")], 1].mean())
 
 
 def ankle_height_m(body: Body) -> float:

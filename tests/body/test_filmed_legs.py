@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
-from pipeline.body.filmed_legs import HEIGHTS, LegProfile, height_on_legs_m, leg_profile, rest_with_filmed_legs
+from pipeline.body.filmed_legs import HEIGHTS, LegProfile, leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion
@@ -68,7 +68,7 @@ def profile_of(body: Body, mask: np.ndarray) -> LegProfile:
 def hem_of(profile: LegProfile, body: Body) -> float:
     """Height of the hem, m; nan without one."""
     height = profile.hem_height()
-    return float("nan") if height is None else height_on_legs_m(body, height)
+    return float("nan") if height is None else body.height_on_legs_m(height)
 
 
 def test_bare_legs_and_trousers_hang_apart(body: Body) -> None:
@@ -103,7 +103,7 @@ def test_long_skirts_end_at_their_hems(body: Body, hem_m: float) -> None:
 
 def test_cloth_down_to_the_floor_ends_at_the_lowest_height(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.05, 14, True))
-    assert hem_of(profile, body) == pytest.approx(height_on_legs_m(body, float(HEIGHTS[-1])), abs=0.01)
+    assert hem_of(profile, body) == pytest.approx(body.height_on_legs_m(float(HEIGHTS[-1])), abs=0.01)
 
 
 def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:
