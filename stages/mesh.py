@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
@@ -34,9 +34,10 @@ from pipeline.kernels.common.determinism import deterministic_sums
 from pipeline.kernels.common.heap import trim_heap
 from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.evidence import surface_evidence, with_emptiness
+from pipeline.mesh.extraction.evidence import Evidence, gather_evidence, with_emptiness
+from pipeline.mesh.extraction.fairing import fair_surface
+from pipeline.mesh.extraction.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.face_reduction import reduce_faces
-from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.field_views import render_field_views
 from pipeline.mesh.files import (
     DENSE_NPZ,
@@ -47,7 +48,6 @@ from pipeline.mesh.files import (
     save_dense_mesh,
     save_mesh,
 )
-from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.outline_alignment import align_outlines
 from pipeline.mesh.pose_alignment import MAX_PERSON_PX, AlignedSurface
 from pipeline.mesh.pose_selection import in_other_poses, is_far_from, merge_poses, score_motion
@@ -206,7 +206,7 @@ def starting_mesh(
     samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, voxel_size_m, settings)
     witnesses = [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)]
     samples = with_emptiness(samples, body, witnesses)
-    evidence = surface_evidence(body, witnesses, samples.ambiguous_m)
+    evidence = gather_evidence(body, witnesses, samples.ambiguous_m)
     extracted = extract_initial_mesh(samples, body, evidence, inputs.validation or train, settings)
     return remesh_to_edge_length(extracted, inputs.target_edge_m, body)
 
@@ -274,14 +274,13 @@ def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config)
 def extract_initial_mesh(
     samples: CanonicalGrid,
     body: Body,
-    evidence: Float[np.ndarray, "v"],
+    evidence: Evidence,
     views: Sequence[PosedView],
     settings: MeshSettings,
 ) -> Mesh:
     """Extract the surface of the density at the isovalue with the highest silhouette IoU.
 
-    The IoU is computed on at most `settings.isovalue_frames` of the views. evidence: how well the training views show
-    each body vertex.
+    The IoU is computed on at most `settings.isovalue_frames` of the views. evidence: what the training views tell.
     """
     isovalue_views = [views[k] for k in evenly_spaced(len(views), settings.isovalue_frames)]
 
@@ -382,7 +381,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=49,
+    version=50,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

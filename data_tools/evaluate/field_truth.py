@@ -31,7 +31,7 @@ from pipeline.geometry.similarity import SimilarityTransform
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import read_rgba
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
+from pipeline.mesh.extraction.isosurface import extract_mesh, sample_canonical_grid
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import transfer_skin
 from pipeline.metrics.alignment import align_surfaces_icp

@@ -18,8 +18,8 @@ from pipeline.geometry.surface import (
     signed_distance_m,
     subdivide,
 )
+from pipeline.mesh.extraction.isosurface import hand_skin_weights
 from pipeline.mesh.face import HAIR_OFFSET_M, face_weight, head_vertices, is_ear
-from pipeline.mesh.isosurface import hand_skin_weights
 from pipeline.mesh.settings import MeshSettings
 
 DECIMATION_FACE_RATIO = 3.0

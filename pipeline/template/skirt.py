@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import remove_unreferenced_vertices
-from pipeline.mesh.between_legs import crotch_height_m
+from pipeline.mesh.extraction.between_legs import crotch_height_m
 from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (

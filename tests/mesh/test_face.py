@@ -8,12 +8,13 @@ from torch import Tensor
 
 from pipeline.body.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.extraction.fairing import fair_surface
+from pipeline.mesh.extraction.isosurface import extract_mesh, sample_canonical_grid
 from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices, is_ear
-from pipeline.mesh.fairing import fair_surface
-from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
 from pipeline.mesh.remeshing import detailed_faces, face_of_person
 from pipeline.mesh.settings import MeshSettings
 from tests.mesh.capsule import capsule_body
+from tests.mesh.full_evidence import full_evidence
 
 HEAD_M, HAIR_M = 0.11, 0.035
 
@@ -97,7 +98,7 @@ def test_fairing_keeps_hair_over_the_forehead_and_smooths_the_face() -> None:
     bounds_m = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]) * (HEAD_M + HAIR_M + 0.02)
     samples = sample_canonical_grid(hairy_density, bounds_m, head, 0.006, settings)
     rough = extract_mesh(samples, 100.0, settings)
-    fair = fair_surface(rough, samples, head, head.mesh(), np.ones(len(head.vertices)), settings)
+    fair = fair_surface(rough, samples, head, head.mesh(), full_evidence(head), settings)
     offset_m = np.linalg.norm(fair.vertices, axis=1) - HEAD_M
     x, y, z = fair.vertices.T
     assert np.median(offset_m[(z > 0.03) & (y > 0.08)]) == pytest.approx(HAIR_M, abs=0.006)

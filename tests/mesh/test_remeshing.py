@@ -9,7 +9,7 @@ from pipeline.core.progress import take_warnings
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold, subdivide
 from pipeline.mesh import remeshing as remeshing_module
-from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
+from pipeline.mesh.extraction.isosurface import extract_mesh, sample_canonical_grid
 from pipeline.mesh.remeshing import remesh_adaptively, remesh_to_edge_length, remesh_uniformly
 from tests.mesh import capsule
 from tests.mesh.egg import EDGE_M, SETTINGS

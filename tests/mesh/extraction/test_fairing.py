@@ -10,17 +10,13 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.geometry.surface import is_closed_manifold
-from pipeline.mesh.fairing import SIGMAS_M, fair_surface, local_thickness_m, smooth_with_local_sigma
-from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
+from pipeline.mesh.extraction.fairing import SIGMAS_M, fair_surface, local_thickness_m, smooth_with_local_sigma
+from pipeline.mesh.extraction.isosurface import extract_mesh, sample_canonical_grid
 from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, capsule_body, capsule_distance
+from tests.mesh.full_evidence import full_evidence
 
 SPACING_M, CLOTH_M, BUMP_M = 0.01, 0.03, 0.006
 WITHOUT_HANDS = replace(SETTINGS, hands_from_body=False, solid_core_depth_m=0.09)
-
-
-def seen(body: Body) -> np.ndarray:
-    """Every vertex is well seen."""
-    return np.ones(len(body.vertices))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +36,7 @@ def test_bumps_go_and_the_offset_of_the_cloth_stays(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
     settings = replace(WITHOUT_HANDS, blur_sigma_voxels=0.0)
     rough = extract_mesh(samples, 100.0, settings)
-    fair = fair_surface(rough, samples, body, body.mesh(), seen(body), settings)
+    fair = fair_surface(rough, samples, body, body.mesh(), full_evidence(body), settings)
     assert is_closed_manifold(fair)
     deviation_m = [capsule_distance(mesh.vertices) - RADIUS_M - CLOTH_M for mesh in (rough, fair)]
     assert deviation_m[0].std() > 0.0015
@@ -51,7 +47,10 @@ def test_bumps_go_and_the_offset_of_the_cloth_stays(body: Body) -> None:
 def test_without_fairing_the_mesh_is_returned_as_it_is(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, 0.02, WITHOUT_HANDS)
     mesh = extract_mesh(samples, 100.0, WITHOUT_HANDS)
-    assert fair_surface(mesh, samples, body, body.mesh(), seen(body), replace(WITHOUT_HANDS, fairing_ratio=0.0)) is mesh
+    assert (
+        fair_surface(mesh, samples, body, body.mesh(), full_evidence(body), replace(WITHOUT_HANDS, fairing_ratio=0.0))
+        is mesh
+    )
 
 
 def test_local_thickness_is_the_radius_of_the_part(body: Body) -> None:
@@ -101,7 +100,7 @@ def test_what_no_frame_shows_is_as_far_off_the_body_as_what_is_seen_beside_it(bo
 
     samples = sample_canonical_grid(lumps, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
     rough = extract_mesh(samples, 100.0, WITHOUT_HANDS)
-    evidence = (body.vertices[:, 2] > middle_m[2]).astype(float)
+    evidence = replace(full_evidence(body), of_vertices=(body.vertices[:, 2] > middle_m[2]).astype(float))
     fair = fair_surface(rough, samples, body, body.mesh(), evidence, WITHOUT_HANDS)
     height_m = [
         [(side * (mesh.vertices[:, 2] - middle_m[2])).max() - RADIUS_M - CLOTH_M for side in (-1.0, 1.0)]
@@ -114,6 +113,8 @@ def test_what_no_frame_shows_is_as_far_off_the_body_as_what_is_seen_beside_it(bo
 
 def test_hands_keep_the_shape_of_the_body(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, SETTINGS)
-    fair = fair_surface(extract_mesh(samples, 100.0, SETTINGS), samples, body, body.mesh(), seen(body), SETTINGS)
+    fair = fair_surface(
+        extract_mesh(samples, 100.0, SETTINGS), samples, body, body.mesh(), full_evidence(body), SETTINGS
+    )
     hand = fair.vertices[:, 0] > 0.2
     np.testing.assert_allclose(capsule_distance(fair.vertices[hand]), RADIUS_M, atol=0.004)

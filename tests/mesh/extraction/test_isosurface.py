@@ -10,7 +10,7 @@ from torch import Tensor
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import is_closed_manifold
-from pipeline.mesh.isosurface import (
+from pipeline.mesh.extraction.isosurface import (
     extract_mesh,
     hand_skin_weights,
     indicator_grid,

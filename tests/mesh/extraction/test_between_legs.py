@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.mesh.between_legs import (
+from pipeline.mesh.extraction.between_legs import (
     PARTING_M,
     VALLEY_RADIUS_M,
     LegGrid,
@@ -13,19 +13,7 @@ from pipeline.mesh.between_legs import (
     gaps_in_skirt,
     parted_legs,
 )
-
-LEG_X_M, LEG_RADIUS_M, CROTCH_M = 0.12, 0.06, 0.5
-GRID_M = 0.005
-
-
-def leg_grid(leg_x_m: float = LEG_X_M, hem_m: float | None = None) -> tuple[LegGrid, tuple[np.ndarray, ...]]:
-    """Two vertical legs, which are one trunk above the crotch, on a grid; coordinates of its samples."""
-    axes = np.arange(-0.3, 0.3001, GRID_M), np.arange(0.0, 0.6001, GRID_M), np.arange(-0.2, 0.2001, GRID_M)
-    x, y, z = np.meshgrid(*axes, indexing="ij")
-    legs_m = np.hypot(np.abs(x) - leg_x_m, z) - LEG_RADIUS_M
-    trunk_m = np.maximum(np.hypot(x, z) - 0.18, CROTCH_M - y)
-    origin_m = np.array([axis[0] for axis in axes])
-    return LegGrid(origin_m, GRID_M, np.minimum(legs_m, trunk_m), CROTCH_M, hem_m), (x, y, z)
+from tests.mesh.extraction.two_legs import CROTCH_M, GRID_M, LEG_RADIUS_M, LEG_X_M, leg_grid
 
 
 def test_strands_and_ridges_between_legs_are_excess() -> None:

@@ -10,7 +10,7 @@ told by colours alone. Both are ambiguous, and near them density is arbitrary.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,8 +26,9 @@ from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.raster import rasterize
-from pipeline.mesh.between_legs import closing, gaps_in_skirt
-from pipeline.mesh.isosurface import CanonicalGrid, upsample
+from pipeline.mesh.extraction.between_legs import closing, gaps_in_skirt
+from pipeline.mesh.extraction.isosurface import CanonicalGrid, upsample
+from pipeline.mesh.extraction.skirt_ring import RingEvidence, ring_evidence
 from pipeline.mesh.views import PosedView
 from pipeline.texture.views import vertex_view_cosine
 
@@ -68,6 +69,24 @@ MIN_DENSITY_PER_M = 2.0
 """Less density is nothing already: a quarter of the smallest isovalue."""
 DEPTH_TOLERANCE_M = 0.02
 """Distance behind the nearest surface up to which a vertex is visible."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the frames tell of the surface.
+
+    of_vertices: how well they show each body vertex, in [0, 1]. of_ring: what they tell of the sides of a skirt.
+    """
+
+    of_vertices: Float[np.ndarray, "v"]
+    of_ring: RingEvidence
+
+
+def gather_evidence(
+    body: Body, views: Sequence[PosedView], ambiguous_m: Float[np.ndarray, "k 3"] | None = None
+) -> Evidence:
+    """Return what the views tell; see `surface_evidence`."""
+    return Evidence(surface_evidence(body, views, ambiguous_m), ring_evidence(body, views))
 
 
 def surface_evidence(
@@ -209,6 +228,6 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     ambiguous[candidates] |= is_told_by_colours_alone(points_m, body, views)
     emptiness = upsample((is_empty | ambiguous).astype(np.float64), samples.density.shape).astype(np.float16)
     ambiguous_m = np.argwhere(ambiguous & solid) * coarse.spacing_m + coarse.origin_m
-    # Cloth between the legs has rules of its own (`pipeline.mesh.between_legs`).
+    # Cloth between the legs has rules of its own (`pipeline.mesh.extraction.between_legs`).
     ambiguous_m = ambiguous_m[ambiguous_m[:, 1] > coarse.crotch_m]
     return replace(samples, emptiness=emptiness, ambiguous_m=ambiguous_m)

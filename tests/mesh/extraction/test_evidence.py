@@ -9,8 +9,8 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from pipeline.mesh import evidence
-from pipeline.mesh.evidence import (
+from pipeline.mesh.extraction import evidence
+from pipeline.mesh.extraction.evidence import (
     AMBIGUOUS_FADE_M,
     AMBIGUOUS_REACH_M,
     CONTRADICTED_SHARE,
@@ -21,7 +21,7 @@ from pipeline.mesh.evidence import (
     surface_evidence,
     with_emptiness,
 )
-from pipeline.mesh.isosurface import sample_canonical_grid
+from pipeline.mesh.extraction.isosurface import sample_canonical_grid
 from pipeline.mesh.views import PosedView
 from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
 

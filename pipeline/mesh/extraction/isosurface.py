@@ -22,7 +22,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.between_legs import (
+from pipeline.mesh.extraction.between_legs import (
     LegGrid,
     closing,
     crotch_height_m,
@@ -54,7 +54,7 @@ class CanonicalGrid(LegGrid):
     density: 1/m. hand_weight: skin weight of the hand joints, in [0, 1]. emptiness: 1 where nothing is whatever the
     density, 0 elsewhere.
     ambiguous_m: empty samples above the crotch with density, which frames put there for another part of the body; see
-    `pipeline.mesh.evidence`.
+    `pipeline.mesh.extraction.evidence`.
 
     Weight and emptiness are kept in half precision, because a fine grid has 25 million samples.
     """

@@ -5,9 +5,10 @@ has bumps. Cloth that lies on a body varies over lengths in proportion to the th
 offset, the signed distance to the extracted surface less that to the body, is therefore smoothed by a Gaussian whose
 standard deviation is a fraction of the local thickness, and added to the signed distance to the body again.
 
-Where few frames show the surface (`pipeline.mesh.evidence`) the density is arbitrary. There the offset is that of what
-is seen around it, farther away the less is seen: a normalised convolution (Knutsson and Westin, "Normalized and
-differential convolution", 1993). What no frame shows is thus as far off the body as what is seen beside it.
+Where few frames show the surface (`pipeline.mesh.extraction.evidence`) the density is arbitrary. There the offset is
+that of what is seen around it, farther away the less is seen: a normalised convolution (Knutsson and Westin,
+"Normalized and differential convolution", 1993). What no frame shows is thus as far off the body as what is seen beside
+it. A skirt is completed before (`pipeline.mesh.extraction.skirt_ring`).
 
 Hands and the skin of the head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed
 in the same way first, because cloth and hair do not show them. In the face the offset is smoothed over a fixed length.
@@ -27,9 +28,11 @@ from scipy.spatial import cKDTree
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, repair, signed_distance_m
-from pipeline.mesh.between_legs import close_valleys
+from pipeline.mesh.extraction.between_legs import close_valleys
+from pipeline.mesh.extraction.evidence import Evidence
+from pipeline.mesh.extraction.isosurface import CanonicalGrid, signed_distance_grid, upsample
+from pipeline.mesh.extraction.skirt_ring import complete_skirt
 from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices
-from pipeline.mesh.isosurface import CanonicalGrid, signed_distance_grid, upsample
 from pipeline.mesh.settings import MeshSettings
 
 SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.06)
@@ -63,7 +66,7 @@ def fair_surface(
     samples: CanonicalGrid,
     body: Body,
     outer_surface: Mesh,
-    evidence: Float[np.ndarray, "v"],
+    evidence: Evidence,
     settings: MeshSettings,
 ) -> Mesh:
     """Return the surface with a smoothed offset from the body, closed and dense as from marching cubes.
@@ -74,7 +77,7 @@ def fair_surface(
         body: the fitted body in its canonical pose.
         outer_surface: its surface without cavities, to which offsets refer: behind lips and lids a surface that lies
             deeper than the body's would have holes.
-        evidence: how well the frames show each body vertex, in [0, 1], from `pipeline.mesh.evidence`.
+        evidence: what the frames tell.
         settings: `fairing_ratio` is the standard deviation over the local thickness; 0 returns the mesh as it is.
 
     Raises:
@@ -86,8 +89,11 @@ def fair_surface(
     counts = np.array(coarse.density.shape)
     surface_m = signed_distance_grid(mesh, coarse.origin_m, counts, coarse.spacing_m)
     near = np.abs(surface_m) < EXACT_BAND_M
+    surface_m[near] = signed_distance_m(np.argwhere(near) * coarse.spacing_m + coarse.origin_m, mesh)
+    skirt = complete_skirt(surface_m, coarse, body, evidence.of_ring)
+    surface_m = skirt.distance_m
+    near |= (skirt.share > 0.0) & (np.abs(surface_m) < EXACT_BAND_M)
     points = np.argwhere(near) * coarse.spacing_m + coarse.origin_m
-    surface_m[near] = signed_distance_m(points, mesh)
     body_m = coarse.body_distance_m.copy()
     body_m[near] = signed_distance_m(points, outer_surface)
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
@@ -96,7 +102,8 @@ def fair_surface(
     clothed_m = _without_creases(smooth_with_local_sigma(body_m, sigma_m, coarse.spacing_m), coarse.spacing_m)
     detail = ndimage.gaussian_filter(np.maximum(coarse.hand_weight > 0.0, skin), DETAIL_BLEND_M / coarse.spacing_m)
     reference_m = clothed_m + detail * (body_m - clothed_m)
-    seen = _evidence_grid(coarse, body, evidence)
+    seen = _evidence_grid(coarse, body, evidence.of_vertices)
+    seen += (1.0 - seen) * ndimage.gaussian_filter(skirt.share, EVIDENCE_SIGMA_M / coarse.spacing_m, truncate=3.0)
     offset_sigma_m = sigma_m + (1.0 - seen) * np.maximum(UNSEEN_SIGMA_M - sigma_m, 0.0)
     weight = np.maximum(seen, MIN_EVIDENCE)
     offset_m = smooth_with_local_sigma(surface_m - reference_m, offset_sigma_m, coarse.spacing_m, weight)
