@@ -2,11 +2,11 @@
 
 Where frames do not show a surface, or at grazing angles only, the density there is arbitrary: clothes on the back of a
 person filmed from the front, the neck under the chin, soles, armpits. Where all frames show it from nearly the same
-side, its depth is arbitrary. Density that a frame cannot see, because another part of the body takes the rays there, is
-arbitrary too; the masks of many frames together tell where nothing is. And where a pose brings two canonical points to
-one place, at an arm on the hip, frames put density on both: the one that the pose brings near to the body is a copy.
-What covers another part of the body in most frames, such as a collar before the shoulder that moves with the head, is
-told by colours alone. Both are ambiguous, and near them density is arbitrary.
+side, its depth is arbitrary, unless it is an outline. Density that a frame cannot see, because another part of the body
+takes the rays there, is arbitrary too; the masks of many frames together tell where nothing is. And where a pose brings
+two canonical points to one place, at an arm on the hip, frames put density on both: the one that the pose brings near
+to the body is a copy. What covers another part of the body in most frames, such as a collar before the shoulder that
+moves with the head, is told by colours alone. Both are ambiguous, and near them density is arbitrary.
 """
 
 from collections.abc import Sequence
@@ -28,18 +28,24 @@ from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.raster import rasterize
 from pipeline.mesh.extraction.between_legs import closing, gaps_in_skirt
 from pipeline.mesh.extraction.isosurface import CanonicalGrid, upsample
-from pipeline.mesh.extraction.skirt_ring import RingEvidence, ring_evidence
+from pipeline.mesh.extraction.skirt_ring import (
+    ENOUGH_OUTLINES,
+    NO_SPREAD,
+    OUTLINE_COSINE,
+    RingEvidence,
+    ring_evidence,
+)
 from pipeline.mesh.views import PosedView
 from pipeline.texture.views import vertex_view_cosine
 
 ENOUGH_EVIDENCE = 0.05
 """Mean over frames of the squared cosine between normal and view direction from which on a vertex counts as seen, with
 0 in frames that do not show it. On a full turn a convex surface has 0.25."""
-ENOUGH_SPREAD = 0.04
-"""One minus the length of the mean direction to the camera, weighted by the squared cosines, from which on frames tell
-the depth of a vertex. A full turn has 0.15, an arc of 90 degrees 0.08, of 40 degrees 0.02."""
-DEPTH_SHARE = 0.5
-"""Part of its evidence that a vertex loses whose depth no frame tells: its outline is seen all the same."""
+ENOUGH_SPREAD = 0.15
+"""Spread of the directions to the camera, as of `NO_SPREAD`, from which on frames tell the depth of a vertex: that of a
+full turn. Less tells less."""
+DEPTH_SHARE = 0.9
+"""Part of its evidence that a vertex loses whose depth no frame tells. As an outline (`OUTLINE_COSINE`) it has all."""
 CONTRADICTED_SHARE = 0.15
 """Share of the frames in which a point lies beside the person from which on nothing is there: strands below a wide
 skirt have 0.3 and more, the surface of four people hardly anywhere more than 0.1."""
@@ -98,7 +104,7 @@ def surface_evidence(
     """
     vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
     faces = torch.from_numpy(body.faces)
-    total, direction = torch.zeros(len(vertices)), torch.zeros(len(vertices), 3)
+    total, outline, direction = torch.zeros(len(vertices)), torch.zeros(len(vertices)), torch.zeros(len(vertices), 3)
     nearest_joint = weights.argmax(dim=1)
     for view in views:
         posed, camera = view.pose_vertices(vertices, weights), view.camera
@@ -106,18 +112,19 @@ def surface_evidence(
         vertices_px, depth_m = project(posed, camera)
         _, _, nearest_m = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
         row, column, inside = _pixels(vertices_px, camera)
-        inside &= cosine > 0.0
-        shown = torch.zeros_like(inside)
+        shown = inside.clone()
         shown[inside] = depth_m[inside] < nearest_m[row[inside], column[inside]] + DEPTH_TOLERANCE_M
-        weight = shown * cosine.square()
+        outline += shown & (cosine.abs() < OUTLINE_COSINE)
+        weight = shown * cosine.clamp_min(0.0).square()
         towards = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).to(posed) - posed, dim=1)
         rotation = view.canonical_to_world[nearest_joint, :3, :3]
         total += weight
         direction += weight[:, None] * (towards[:, None] @ rotation)[:, 0]
     spread = 1.0 - direction.norm(dim=1) / total.clamp_min(1e-12)
     seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
-    depth = (spread / ENOUGH_SPREAD).clamp(0.0, 1.0)
-    evidence = (seen * (1.0 - DEPTH_SHARE * (1.0 - depth))).numpy()
+    depth = ((spread - NO_SPREAD) / (ENOUGH_SPREAD - NO_SPREAD)).clamp(0.0, 1.0)
+    told_by_outline = (outline / len(views) / ENOUGH_OUTLINES).clamp(0.0, 1.0)
+    evidence = torch.maximum(seen * (1.0 - DEPTH_SHARE * (1.0 - depth)), told_by_outline).numpy()
     if ambiguous_m is None:
         return evidence
     distance_m, _ = cKDTree(ambiguous_m).query(body.vertices)

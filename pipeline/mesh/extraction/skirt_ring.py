@@ -29,8 +29,7 @@ ENOUGH_FACING = 0.05
 """Mean over frames of the squared cosine from which on a side counts as seen, as for a vertex of the body."""
 NO_SPREAD, ENOUGH_SPREAD = 0.05, 0.12
 """One minus the length of the mean direction to the camera, weighted by the squared cosines, up to which frames do not
-tell the depth of a side, and from which on they do. A full turn has 0.15, an arc of 90 degrees 0.08, of 60 0.04. Plain
-cloth needs more than a surface beside the body, whose depth the fit tells too."""
+tell the depth of a side, and from which on they do. A full turn has 0.15, an arc of 90 degrees 0.08, of 40 0.02."""
 HEM_REACH_M = 0.05
 """Slices are completed as far as they hold both legs, down to this distance below the hem that the masks tell."""
 TOP_FADE_M = 0.1
