@@ -19,7 +19,7 @@ from pipeline.body.files import (
     save_motion,
     save_scores,
 )
-from pipeline.body.filmed_legs import leg_profile, rest_with_filmed_legs
+from pipeline.body.filmed_legs import LegProfile, leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.detections.hidden_legs import hidden_leg_share
 from pipeline.body.fit.diagnostics import (
@@ -111,10 +111,15 @@ def run(
     windows = read_mask_windows(capture)
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
     result = fit_capture(capture, hands, windows, config, settings, out)
+    legs = leg_profile_of(result, capture, windows)
+    hem, motion = legs.hem_height(), motion_of(result, capture)
+    # The first body fills a skirt: it tells what is no cloth, and how well the frames fit.
+    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
+    if legs.stands_off():
+        below = fit_capture(capture, hands, windows, config, settings, out, hem)
+        result = replace(below, silhouette_iou=result.silhouette_iou)
+        hem, motion = leg_profile_of(result, capture, windows).hem_height() or hem, motion_of(result, capture)
     usable, training = usable_frames(result), capture.split == TRAIN
-    motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
-    legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
-    hem = legs.hem_height()
     if hem is not None:
         rest, bare = (rest_with_filmed_legs(body, motion, training & usable) for body in (result.body, result.bare))
         motion, body = rest.motion, replace(rest.body, hem_m=rest.body.height_on_legs_m(hem))
@@ -124,7 +129,6 @@ def run(
     save_body(out / _BARE, result.bare)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
-    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
     scores = FrameScores(
         frame_index=capture.frame_index,
         silhouette_iou=result.silhouette_iou,
@@ -164,6 +168,17 @@ def run(
     }
 
 
+def motion_of(result: FitResult, capture: Capture) -> Motion:
+    """Return the fitted poses of the frames of a capture."""
+    return Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
+
+
+def leg_profile_of(result: FitResult, capture: Capture, windows: Sequence[MaskWindow | None]) -> LegProfile:
+    """Compare the masks of the training frames with the legs of a fitted body."""
+    frames = (capture.split == TRAIN) & usable_frames(result)
+    return leg_profile(result.body, motion_of(result, capture), result.camera, windows, frames)
+
+
 def read_mask_windows(capture: Capture) -> list[MaskWindow | None]:
     """Return each frame's mask in its matching window (None if it is empty), all that the fit needs of it."""
 
@@ -181,11 +196,12 @@ def fit_capture(
     config: Config,
     settings: FitSettings = DEFAULT_SETTINGS,
     out: Path | None = None,
+    hem: float | None = None,
 ) -> FitResult:
     """Fit the body to a capture and check the quality of the fit.
 
     hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`. out: folder of the
-    checkpoints; None: none.
+    checkpoints; None: none. hem: of a skirt that stands off the legs, see `FitOptions`; supplied poses ignore it.
 
     Raises:
         UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
@@ -204,6 +220,7 @@ def fit_capture(
         config.shared_frames,
         config.rounds,
         capture.camera_pose_is_known,
+        hem,
         settings,
     )
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
@@ -324,7 +341,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=37,
+    version=38,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -59,6 +59,10 @@ MIN_MARGIN_M, MIN_STEP_M = 0.02, 0.015
 """Cloth ends at a hem where its distance from the legs, left and right, is at least the first and falls by the second.
 Trousers of four people: at most 0.005 m; a knee-long coat 0.03, a wide skirt 0.23."""
 
+MIN_SKIRT_STEP_M = 0.05
+"""A hem with this step is that of a skirt that stands off the legs, whose outline says little of them. Coats of one
+person: 0.025 to 0.042, skirts with 7 to 24 cm of flare: 0.07 to 0.21."""
+
 MAX_OPEN_SHARE = 0.1
 """Share of the pixels between the legs above the hem that may show the background: through shorts it is seen."""
 
@@ -126,6 +130,10 @@ class LegProfile:
             is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px < MIN_OPEN_SHARE * self.gap_px)
             below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(HEIGHTS)
         return float(HIGHEST + HEIGHT_STEP * (below - 0.5))
+
+    def stands_off(self) -> bool:
+        """Return whether there is a skirt that stands off the legs at its hem."""
+        return self.cloth_hangs_between_legs() and float(self._step_m().max()) >= MIN_SKIRT_STEP_M
 
     def _step_m(self) -> Float[np.ndarray, "k"]:
         """Return how far the margin falls below each height; 0 where it is not wide enough for the cloth of a hem."""

@@ -88,6 +88,13 @@ def test_a_skirt_ends_at_its_hem(body: Body) -> None:
     assert np.nanmin(profile.margin_m[above]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
 
 
+def test_a_skirt_with_a_wide_hem_stands_off(body: Body) -> None:
+    """A pixel is 5 mm."""
+    assert profile_of(body, dressed(body, 0.5, 16, between=True)).stands_off()
+    assert not profile_of(body, dressed(body, 0.5, 5, between=True)).stands_off()
+    assert not profile_of(body, silhouette(body)).stands_off()
+
+
 def test_a_close_skirt_covers_the_gap(body: Body) -> None:
     """Its hem is no step: the fitted hips are as wide as the skirt."""
     profile = profile_of(body, dressed(body, 0.6, 2, True))

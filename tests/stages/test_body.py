@@ -9,7 +9,9 @@ from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
 from pipeline.body.files import load_body, load_camera, load_motion, load_scores
+from pipeline.body.filmed_legs import HEIGHTS, LegProfile
 from pipeline.body.fit.fit import TooFewLandmarksError
+from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
 from pipeline.body.settings import FitSettings
 from pipeline.capture.capture import (
@@ -108,6 +110,24 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
     assert not (tiles == WARNING_RGB).all(-1).any()
     assert take_warnings() == []
+
+
+def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene: SyntheticRecording) -> None:
+    """The frames keep the IoU of the first fit, which fills the skirt."""
+    write_capture(tmp_path / "frames", scene, scene.camera, scene.masks())
+    (tmp_path / "body").mkdir()
+    margin_m = np.where(HEIGHTS < 0.9, 0.12, 0.0)
+    skirt = LegProfile(margin_m, np.full(len(HEIGHTS), 8.0), np.where(HEIGHTS < 0.9, 0.0, 8.0))
+    with (
+        mock.patch("stages.body.leg_profile_of", return_value=skirt),
+        mock.patch("stages.body.fit_body_without_others", wraps=fit_body_without_others) as fit,
+    ):
+        run({"frames": tmp_path / "frames"}, tmp_path / "body", Config(height_m=scene.model.height_m()[0], rounds=1))
+    assert [call.args[3].hem for call in fit.call_args_list] == [None, skirt.hem_height()]
+    first = fit_body_without_others(*fit.call_args_list[0].args[:5])
+    np.testing.assert_array_equal(load_scores(tmp_path / "body" / "scores.npz").silhouette_iou, first.silhouette_iou)
+    body = load_body(tmp_path / "body" / "body.npz")
+    assert body.hem_m == pytest.approx(body.height_on_legs_m(skirt.hem_height() or np.nan))
 
 
 @pytest.mark.parametrize("is_known", [True, False])

@@ -22,6 +22,7 @@ class FitContext:
     default: the body at the default shape.
     clothing_m: from `prior.clothing.clothing_offsets`; without columns, the body is bare. The shape parameters of the
         fit are those of the body followed by those of the clothing.
+    hem: of a skirt, see `FitOptions`.
     """
 
     body: ParametricBody
@@ -32,6 +33,7 @@ class FitContext:
     clothing_m: Float[Tensor, "v 3 c"]
     curls_rad: Float[np.ndarray, "2 4"]
     settings: FitSettings
+    hem: float | None = None
 
     @classmethod
     def of(

@@ -99,7 +99,7 @@ def fit_body(
     """
     _check_landmarks(observations)
     curls_rad = relaxed_curls_rad() if curls_rad is None else curls_rad
-    context = FitContext.of(body, curls_rad, options.settings, has_clothing=True)
+    context = replace(FitContext.of(body, curls_rad, options.settings, has_clothing=True), hem=options.hem)
     offset_count = context.regressor.offset_jacobian.shape[-1]
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
@@ -290,7 +290,7 @@ def _fit_poses(
         motion_std = estimate_motion_std(state.rotations, root_perspective, observations.time_s)
         recording = _Recording(posture, motion_std)
         save_progress(checkpoint, replace(progress, state=state, rounds_done=number + 1, motion_std=motion_std))
-    _, silhouette_iou = match_silhouettes(model, state, observations, windows)
+    _, silhouette_iou = match_silhouettes(model, state, observations, windows, context.hem)
     return state, model, silhouette_iou
 
 
@@ -304,7 +304,7 @@ def _silhouette_round(
     recording: _Recording,
 ) -> tuple[FitState, NormalEquations, Objective]:
     """Match the silhouettes of the current body, then minimise the energy; return the objective as well."""
-    contour, _ = match_silhouettes(model, state, observations, windows)
+    contour, _ = match_silhouettes(model, state, observations, windows, context.hem)
     objective = Objective(
         model,
         context.regressor,

@@ -17,6 +17,8 @@ class FitOptions:
     shared_frames: number of frames for the shared parameters.
     rounds: largest number of matchings of the silhouettes for the shared parameters.
     vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
+    hem: height of the hem of a skirt whose outline says little of the legs, as of `Body.height_on_legs_m`; None
+        without one.
     """
 
     height_m: float | None = None
@@ -25,6 +27,7 @@ class FitOptions:
     shared_frames: int = 48
     rounds: int = 8
     vertical_is_known: bool = True
+    hem: float | None = None
     settings: FitSettings = DEFAULT_SETTINGS
 
 

@@ -23,7 +23,7 @@ from pipeline.core.progress import warn
 
 MAX_REJECTED_SHARE = 0.3
 """Share of rejected frames above which it is unclear who the person is, and the first fit is kept."""
-CHECKPOINTS = ("checkpoint_first_fit.safetensors", "checkpoint_second_fit.safetensors")
+CHECKPOINTS = ("checkpoint_first_fit", "checkpoint_second_fit")
 
 
 def fit_body_without_others(
@@ -38,12 +38,13 @@ def fit_body_without_others(
 
     Their poses are then those between the frames around them, and their silhouette IoU is 0: they are not trained on.
 
-    out: folder of the checkpoints, one for each fit; None: none.
+    out: folder of the checkpoints, one for each fit, with and without a hem; None: none.
 
     Raises:
         TooFewLandmarksError: as `fit_body`.
     """
-    checkpoints = [None if out is None else out / name for name in CHECKPOINTS]
+    suffix = ".safetensors" if options.hem is None else "_with_hem.safetensors"
+    checkpoints = [None if out is None else out / f"{name}{suffix}" for name in CHECKPOINTS]
     first = fit_body(body, observations, windows, options, curls_rad, checkpoints[0])
     rejected = frames_of_others(first)
     if not rejected.any() or rejected.mean() > MAX_REJECTED_SHARE:

@@ -45,6 +45,11 @@ CLOTHING_WEIGHT = 0.5
 HAIR_AND_SHOES_WEIGHT = 0.05
 """The same on head and feet: hair and shoes make the silhouette taller, which would move the person to the camera."""
 
+SKIRT_TOP = -0.25
+"""Height up to which a skirt may hide the body, as of `Body.height_on_legs_m`."""
+
+SKIRT_JOINTS = ("Hips", "LeftUpLeg", "LeftLeg", "RightUpLeg", "RightLeg")
+
 HEAD_AND_FOOT_JOINTS = ("Head", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 FULL_WEIGHT_IOU_DROP, MIN_WEIGHT_IOU_DROP = 0.05, 0.15
@@ -264,20 +269,39 @@ def mask_weights(silhouette_iou: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n
     )
 
 
+def skirt_faces(model: LinearBody, state: FitState, hem: float) -> Bool[np.ndarray, "f"]:
+    """Return the faces of hips and legs that a skirt hides, between `SKIRT_TOP` and its hem in the canonical pose."""
+    posed = model.at_shape(state.shape)
+    hips_m, knees_m = (
+        posed.joints_m[[ACTIVE_JOINTS.index(side + name) for side in ("Left", "Right")], 1].mean()
+        for name in ("UpLeg", "Leg")
+    )
+    height = (posed.vertices_m[:, 1] - hips_m) / (knees_m - hips_m)
+    is_hidden = (_weight(model, SKIRT_JOINTS) > 0.5) & (height > SKIRT_TOP) & (height < hem)
+    return np.asarray(is_hidden[model.faces[:, 0].long()].numpy())
+
+
+def _weight(model: LinearBody, names: Sequence[str]) -> Float[Tensor, "v"]:
+    """Return the summed skin weight of some joints at each vertex."""
+    return model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in names]].sum(1)
+
+
 def match_silhouettes(
     model: LinearBody,
     state: FitState,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
+    hem: float | None = None,
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
     """Return the silhouette pairs of the current body, and each frame's IoU with its mask (nan without a mask).
 
-    windows: masks of the frames (`crop_mask_window`); None without a mask.
+    windows: masks of the frames (`crop_mask_window`); None without a mask. hem: of a skirt, see `FitOptions`: what it
+    hides has no pairs, unless it is beside the mask.
     """
     camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
     posed = posed_body(model, state)
-    head_and_foot_weight = model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
-    head_and_foot_faces = (head_and_foot_weight > 0.5)[model.faces[:, 0].long()].numpy()
+    head_and_foot_faces = (_weight(model, HEAD_AND_FOOT_JOINTS) > 0.5)[model.faces[:, 0].long()].numpy()
+    hidden_faces = np.zeros(len(model.faces), dtype=bool) if hem is None else skirt_faces(model, state, hem)
     face_joint = model.skin_weights.argmax(1)[model.faces[:, 0].long()]
     joint_weight = outline_weights(observations.confidence)
     size = 2 * PAIRS_PER_DIRECTION
@@ -292,15 +316,15 @@ def match_silhouettes(
         body_mask = body_raster.face_id >= 0
         silhouette_iou[frame] = mask_iou(body_mask, window.mask)
         pairs = find_correspondences(window, body_mask, body_mask & head_and_foot_faces[body_raster.face_id])
-        count, used = len(pairs.weight), (pairs.weight > 0).sum()
-        rows, columns = pairs.pixel.T
+        count, (rows, columns) = len(pairs.weight), pairs.pixel.T
         face = torch.from_numpy(body_raster.face_id[rows, columns])
+        pair_weight = pairs.weight * ~(hidden_faces[face] & window.mask[rows, columns])
         corners[frame, :count] = model.faces[face].long()
         barycentric[frame, :count] = torch.from_numpy(body_raster.barycentric[rows, columns]).double()
         target[frame, :count] = torch.from_numpy(pairs.target / window.scale_xy + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
         shown = joint_weight[frame, face_joint[face]]
-        weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_WEIGHT / max(used, 1))) * shown
+        weight[frame, :count] = torch.from_numpy(pair_weight * (FRAME_WEIGHT / max((pair_weight > 0).sum(), 1))) * shown
 
     def match_chunk(start: int) -> None:
         chunk = windows[start : start + SKIN_CHUNK]
