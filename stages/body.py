@@ -113,10 +113,12 @@ def run(
     result = fit_capture(capture, hands, windows, config, settings, out)
     legs = leg_profile_of(result, capture, windows)
     hem, motion = legs.hem_height(), motion_of(result, capture)
+    hem_of_skirt = hem if legs.stands_off() else None
     # The first body fills a skirt: it tells what is no cloth, and how well the frames fit.
-    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
-    if legs.stands_off():
-        below = fit_capture(capture, hands, windows, config, settings, out, hem)
+    poses = canonical_to_world(result.body, motion)
+    blob_shares = residual_blob_shares(result.body, poses, result.camera, windows, hem_of_skirt)
+    if hem_of_skirt is not None:
+        below = fit_capture(capture, hands, windows, config, settings, out, hem_of_skirt)
         result = replace(below, silhouette_iou=result.silhouette_iou)
         hem, motion = leg_profile_of(result, capture, windows).hem_height() or hem, motion_of(result, capture)
     usable, training = usable_frames(result), capture.split == TRAIN

@@ -9,7 +9,7 @@ A-pose, whose legs are apart, so that they do not grow together.
 Notation: Q_j rotation of joint j from the old canonical pose to the new one, R_j its local rotation in a frame.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -189,7 +189,7 @@ def _profile_of_frame(
     left, right = legs[:, np.maximum(face_id, 0)] & is_body
     metres_per_px = body.height_m() / window.person_px
     profile = np.full((3, len(HEIGHTS)), np.nan)
-    for k, row in enumerate(_rows_px(body, pose, camera, window)):
+    for k, row in enumerate(rows_on_legs(HEIGHTS, body, pose, camera, window)):
         if not (0 <= row < len(face_id) and left[row].any() and right[row].any()):
             continue
         columns = sorted((np.flatnonzero(left[row]), np.flatnonzero(right[row])), key=np.mean)
@@ -203,8 +203,10 @@ def _profile_of_frame(
     return profile
 
 
-def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow) -> list[int]:
-    """Return the rows of a window at `HEIGHTS`, the mean of both legs."""
+def rows_on_legs(
+    heights: Iterable[float], body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
+) -> list[int]:
+    """Return the rows of a window at heights as of `Body.height_on_legs_m`, the mean of both legs."""
     names = [side[k] for k in (0, 1) for side in LEGS]
     places = [
         pose[joint] @ torch.from_numpy(np.append(body.joints_m[joint], 1.0)).to(pose)
@@ -212,7 +214,7 @@ def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: M
     ]
     px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
     hip_px, knee_px = px[:2].mean(), px[2:].mean()
-    return [int(hip_px + height * (knee_px - hip_px)) for height in HEIGHTS]
+    return [int(hip_px + height * (knee_px - hip_px)) for height in heights]
 
 
 def _run_length(flags: Bool[np.ndarray, "n"]) -> int:

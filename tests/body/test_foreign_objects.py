@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body.body import load_anny
+from pipeline.body.body import Body, load_anny
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.foreign_objects import (
     CLOTHING_MARGIN_RATIO,
@@ -43,6 +43,12 @@ def test_largest_blob_excludes_the_clothing_margin() -> None:
     assert residual_blob_share(mask, blocks(BODY), ROWS) == pytest.approx(34 * 40 / mask.sum())
 
 
+def test_cloth_in_the_rows_of_a_skirt_is_no_residual_blob() -> None:
+    mask = blocks(BODY, (100, 140, 140, 180), (200, 210, 70, 100))
+    assert residual_blob_share(mask, blocks(BODY), ROWS, slice(90, 150)) == pytest.approx(24 * 10 / mask.sum())
+    assert residual_blob_share(mask, blocks(BODY), ROWS, slice(90, 250)) == 0.0
+
+
 def test_only_temporary_blobs_are_foreign_objects() -> None:
     wide_skirt = np.full(9, 0.04)
     assert not frames_with_foreign_objects(wide_skirt).any()
@@ -58,7 +64,8 @@ def test_only_temporary_blobs_are_foreign_objects() -> None:
     assert foreign_object_warnings(wide_skirt[:6], np.arange(6)) == []
 
 
-def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
+def a_pose() -> tuple[Body, Camera, np.ndarray]:
+    """The default body, a camera before it, and its pixels: 10 mm each."""
     anny = load_anny()
     body = anny.at_shape(anny.shape_defaults)
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
@@ -66,7 +73,22 @@ def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
     camera = Camera(300.0, 300.0, 150.0, 150.0, 300, 300, world_to_camera)
     vertices_px, depth_m = project(torch.as_tensor(body.vertices), camera)
     face_id, _, _ = rasterize(vertices_px, depth_m, torch.as_tensor(body.faces), 300, 300)
-    alone = np.where(face_id.numpy() >= 0, np.uint8(255), np.uint8(0))
+    return body, camera, np.where(face_id.numpy() >= 0, np.uint8(255), np.uint8(0))
+
+
+def test_a_wide_skirt_is_no_object_where_its_hem_is_known() -> None:
+    body, camera, mask = a_pose()
+    height_m = torch.tensor([[0.0, body.height_on_legs_m(height), 0.0] for height in (-0.2, 0.9)])
+    top, bottom = project(height_m, camera)[0][:, 1].int().tolist()
+    mask[top:bottom, 105:195] = 255
+    identity, windows = torch.eye(4).expand(1, len(body.joint_names), 4, 4), [crop_mask_window(mask)]
+    assert residual_blob_shares(body, identity, camera, windows)[0] > 0.02
+    assert residual_blob_shares(body, identity, camera, windows, hem=1.0)[0] == 0.0
+
+
+def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
+    body, camera, alone = a_pose()
+    vertices_px, _ = project(torch.as_tensor(body.vertices), camera)
     hand_px = vertices_px[body.vertices[:, 0].argmax()].numpy()
     rows, columns = np.mgrid[:300, :300] + 0.5
     with_ball = alone.copy()
