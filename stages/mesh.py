@@ -381,7 +381,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=51,
+    version=52,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

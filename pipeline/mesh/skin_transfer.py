@@ -63,7 +63,7 @@ def build_skinned_topology(mesh: Mesh, weights: Float[Tensor, "v j"]) -> Skinned
 
 
 def transfer_skin_weights(
-    mesh: Mesh, body: Body, max_body_distance_m: float = 0.08, smoothing_steps: int = 4
+    mesh: Mesh, body: Body, max_body_distance_m: float = 0.25, smoothing_steps: int = 4
 ) -> Float[np.ndarray, "v j"]:
     """Return skin weights (rows sum to 1) of a mesh that surrounds the body in the canonical pose.
 

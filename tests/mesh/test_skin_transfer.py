@@ -3,6 +3,7 @@
 import numpy as np
 
 from pipeline.body.body import Body
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface
 from pipeline.mesh.skin_transfer import transfer_skin, transfer_skin_weights
 from tests.mesh.capsule import capsule_body
@@ -51,6 +52,26 @@ def test_weights_are_not_taken_across_a_gap() -> None:
     weights = transfer_skin_weights(sleeve, body)
     assert weights[:, 1].min() > 0.99
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
+
+
+def test_the_hem_of_a_wide_skirt_moves_with_the_leg_below_it() -> None:
+    """A trunk above a leg, and a cone whose hem is 12 cm and more from the leg: it does not follow the trunk there."""
+    tube = isosurface(*tube_values((0.0, 0.0)))
+    leg_weight = np.clip(0.5 - tube.vertices[:, 1] / 0.1, 0.0, 1.0).astype(np.float32)
+    body = Body(
+        joint_names=("Hips", "LeftUpLeg"),
+        parents=np.array([-1, 0], dtype=np.int32),
+        joints_m=np.zeros((2, 3), dtype=np.float32),
+        vertices=tube.vertices,
+        faces=tube.faces,
+        skin_weights=np.stack([1.0 - leg_weight, leg_weight], axis=1),
+        shape={},
+    )
+    widening = np.interp(tube.vertices[:, 1], (-0.3, 0.2), (3.0, 1.1))[:, None]
+    cone = Mesh((tube.vertices * np.where([True, False, True], widening, 1.0)).astype(np.float32), tube.faces)
+    hem = (np.abs(cone.vertices[:, 1] + 0.2) < 0.03) & (np.hypot(cone.vertices[:, 0], cone.vertices[:, 2]) > 0.2)
+    assert hem.any()
+    assert transfer_skin_weights(cone, body)[hem, 1].min() > 0.95
 
 
 def tube_values(centre_xz: tuple[float, float], radius: float = 0.08) -> tuple[np.ndarray, float, np.ndarray, float]:
