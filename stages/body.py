@@ -113,7 +113,7 @@ def run(
     result = fit_capture(capture, hands, windows, config, settings, out)
     legs = leg_profile_of(result, capture, windows)
     hem, motion = legs.hem_height(), motion_of(result, capture)
-    hem_of_skirt = hem if legs.stands_off() else None
+    hem_of_skirt = hem if legs.stands_off() and capture.smpl_poses is None else None
     # The first body fills a skirt: it tells what is no cloth, and how well the frames fit.
     poses = canonical_to_world(result.body, motion)
     blob_shares = residual_blob_shares(result.body, poses, result.camera, windows, hem_of_skirt)
@@ -200,10 +200,10 @@ def fit_capture(
     out: Path | None = None,
     hem: float | None = None,
 ) -> FitResult:
-    """Fit the body to a capture and check the quality of the fit.
+    """Fit the body to a capture and check the quality of the fit, but for that of a body below a skirt.
 
     hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`. out: folder of the
-    checkpoints; None: none. hem: of a skirt that stands off the legs, see `FitOptions`; supplied poses ignore it.
+    checkpoints; None: none. hem: of a skirt that stands off the legs, see `FitOptions`.
 
     Raises:
         UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
@@ -240,7 +240,8 @@ def fit_capture(
             f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "
             f"complete or remove a supplied landmarks.npz, and run {again}"
         ) from error
-    check_fit_quality(result, capture, config, supplied is not None)
+    if hem is None:
+        check_fit_quality(result, capture, config, supplied is not None)
     return result
 
 

@@ -12,6 +12,7 @@ from pipeline.body.files import load_body, load_camera, load_motion, load_scores
 from pipeline.body.filmed_legs import HEIGHTS, LegProfile
 from pipeline.body.fit.fit import TooFewLandmarksError
 from pipeline.body.fit.rejection import fit_body_without_others
+from pipeline.body.fit.result import FitResult
 from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
 from pipeline.body.settings import FitSettings
 from pipeline.capture.capture import (
@@ -118,14 +119,23 @@ def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene:
     (tmp_path / "body").mkdir()
     margin_m = np.where(HEIGHTS < 0.9, 0.12, 0.0)
     skirt = LegProfile(margin_m, np.full(len(HEIGHTS), 8.0), np.where(HEIGHTS < 0.9, 0.0, 8.0))
+    fits = []
+
+    def fit_and_remember(*args) -> FitResult:
+        fits.append(fit_body_without_others(*args))
+        return fits[-1]
+
     with (
         mock.patch("stages.body.leg_profile_of", return_value=skirt),
-        mock.patch("stages.body.fit_body_without_others", wraps=fit_body_without_others) as fit,
+        mock.patch("stages.body.fit_body_without_others", side_effect=fit_and_remember) as fit,
+        mock.patch("stages.body.check_fit_quality", wraps=check_fit_quality) as check,
     ):
         run({"frames": tmp_path / "frames"}, tmp_path / "body", Config(height_m=scene.model.height_m()[0], rounds=1))
     assert [call.args[3].hem for call in fit.call_args_list] == [None, skirt.hem_height()]
-    first = fit_body_without_others(*fit.call_args_list[0].args[:5])
-    np.testing.assert_array_equal(load_scores(tmp_path / "body" / "scores.npz").silhouette_iou, first.silhouette_iou)
+    check.assert_called_once()  # below a skirt the body does not fill the mask
+    scores = load_scores(tmp_path / "body" / "scores.npz")
+    np.testing.assert_array_equal(scores.silhouette_iou, fits[0].silhouette_iou)
+    assert not np.array_equal(fits[0].silhouette_iou, fits[1].silhouette_iou)
     body = load_body(tmp_path / "body" / "body.npz")
     assert body.hem_m == pytest.approx(body.height_on_legs_m(skirt.hem_height() or np.nan))
 
