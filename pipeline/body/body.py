@@ -53,6 +53,10 @@ class Body:
         """
         return self.joint_names.index(name)
 
+    def arm_joints(self) -> list[int]:
+        """Return the indices of the joints of arms and hands."""
+        return [index for index, name in enumerate(self.joint_names) if "Arm" in name or "Hand" in name]
+
     def height_m(self) -> float:
         """Return the height of the A-pose, from sole to crown."""
         return float(np.ptp(self.vertices[:, 1]))

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import remove_unreferenced_vertices
-from pipeline.mesh.extraction.between_legs import crotch_height_m
+from pipeline.mesh.extraction.between_legs import HEM_RANGE_M, crotch_height_m
 from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (
@@ -33,9 +33,6 @@ from pipeline.template.sections import SLICE_M, cut_at_height
 
 MIN_SKIRT_M = 0.06
 """Least length of a skirt below the crotch of the body, which most long shirts do not reach."""
-
-HEM_RANGE_M = 0.05
-"""The hem of the surface is up to this distance from the height that the masks tell."""
 
 MIN_HEM_STEP, HEM_STEP_M = 1.6, 0.1
 """Least ratio of the hull's largest area above the hem to the median below it, each over this height. Generated skirts:
@@ -209,5 +206,4 @@ def leg_axis_m(body: Body, height_m: float) -> tuple[Float[np.ndarray, "2"], Flo
 
 
 def _on_arms(skin_weights: Float[np.ndarray, "v j"], body: Body) -> Bool[np.ndarray, "v"]:
-    joints = [k for k, name in enumerate(body.joint_names) if "Arm" in name or "Hand" in name]
-    return np.asarray(skin_weights[:, joints].sum(axis=1) > 0.5)
+    return np.asarray(skin_weights[:, body.arm_joints()].sum(axis=1) > 0.5)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from pipeline.body.body import Body
-from pipeline.mesh.extraction.evidence import Evidence
-from pipeline.mesh.extraction.skirt_ring import NORMALS, RingEvidence
+from pipeline.mesh.extraction.evidence import NORMALS, Evidence, RingEvidence
 
 
 def full_evidence(body: Body) -> Evidence:

@@ -66,6 +66,10 @@ class LinearBody:
             full_joints_m=self.full_joints_m + self.full_joints_shape_jacobian @ step,
         )
 
+    def skin_weight_of(self, names: Sequence[str]) -> Float[Tensor, "v"]:
+        """Return the summed skin weight of some active joints at each vertex."""
+        return self.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in names]].sum(1)
+
     def all_joint_rotations(self, rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n full 3 3"]:
         """Return the local rotations of all joints: those of the active joints and the fixed ones of the fingers."""
         all_rotations = self.finger_rotations.repeat(len(rotations), 1, 1, 1)

@@ -277,13 +277,8 @@ def skirt_faces(model: LinearBody, state: FitState, hem: float) -> Bool[np.ndarr
         for name in ("UpLeg", "Leg")
     )
     height = (posed.vertices_m[:, 1] - hips_m) / (knees_m - hips_m)
-    is_hidden = (_weight(model, SKIRT_JOINTS) > 0.5) & (height > SKIRT_TOP) & (height < hem)
+    is_hidden = (model.skin_weight_of(SKIRT_JOINTS) > 0.5) & (height > SKIRT_TOP) & (height < hem)
     return np.asarray(is_hidden[model.faces[:, 0].long()].numpy())
-
-
-def _weight(model: LinearBody, names: Sequence[str]) -> Float[Tensor, "v"]:
-    """Return the summed skin weight of some joints at each vertex."""
-    return model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in names]].sum(1)
 
 
 def match_silhouettes(
@@ -300,7 +295,7 @@ def match_silhouettes(
     """
     camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
     posed = posed_body(model, state)
-    head_and_foot_faces = (_weight(model, HEAD_AND_FOOT_JOINTS) > 0.5)[model.faces[:, 0].long()].numpy()
+    head_and_foot_faces = (model.skin_weight_of(HEAD_AND_FOOT_JOINTS) > 0.5)[model.faces[:, 0].long()].numpy()
     hidden_faces = np.zeros(len(model.faces), dtype=bool) if hem is None else skirt_faces(model, state, hem)
     face_joint = model.skin_weights.argmax(1)[model.faces[:, 0].long()]
     joint_weight = outline_weights(observations.confidence)

@@ -29,6 +29,8 @@ CROTCH_SHARE = 0.25
 SKIRT_RADIUS_M = 0.06
 """Gaps in a skirt that a horizontal disc, or a ball, of this radius cannot enter are closed. Where a gap parts the
 legs, the disc is as wide as the space between them."""
+HEM_RANGE_M = 0.05
+"""The hem of the surface is up to this distance from the height that the masks tell."""
 HEM_ERROR_M = 0.02
 """A gap that parts the legs is closed from this height above the hem on."""
 SKIRT_ABOVE_CROTCH_M = 0.2

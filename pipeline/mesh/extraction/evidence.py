@@ -28,22 +28,22 @@ from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.raster import rasterize
 from pipeline.mesh.extraction.between_legs import closing, gaps_in_skirt
 from pipeline.mesh.extraction.isosurface import CanonicalGrid, upsample
-from pipeline.mesh.extraction.skirt_ring import (
-    ENOUGH_OUTLINES,
-    NO_SPREAD,
-    OUTLINE_COSINE,
-    RingEvidence,
-    ring_evidence,
-)
 from pipeline.mesh.views import PosedView
 from pipeline.texture.views import vertex_view_cosine
 
 ENOUGH_EVIDENCE = 0.05
 """Mean over frames of the squared cosine between normal and view direction from which on a vertex counts as seen, with
 0 in frames that do not show it. On a full turn a convex surface has 0.25."""
-ENOUGH_SPREAD = 0.15
-"""Spread of the directions to the camera, as of `NO_SPREAD`, from which on frames tell the depth of a vertex: that of a
-full turn. Less tells less."""
+NO_SPREAD, ENOUGH_SPREAD = 0.05, 0.15
+"""One minus the length of the mean direction to the camera, weighted by the squared cosines, up to which frames do not
+tell the depth of a vertex, and from which on they do. A full turn has 0.15, an arc of 90 degrees 0.08, of 40 0.02."""
+ENOUGH_RING_SPREAD = 0.12
+"""The latter for a side of a skirt: a full turn leaves all of it as it is."""
+OUTLINE_COSINE, ENOUGH_OUTLINES = 0.2, 0.15
+"""Largest cosine between a normal and the direction to the camera with which a frame shows the outline there, and the
+share of such frames that is enough. A full turn has 0.13, which tells by parallax."""
+NORMALS = 72
+"""Number of the normals along which the sides of a skirt are told."""
 DEPTH_SHARE = 0.9
 """Part of its evidence that a vertex loses whose depth no frame tells. As an outline (`OUTLINE_COSINE`) it has all."""
 CONTRADICTED_SHARE = 0.15
@@ -75,6 +75,17 @@ MIN_DENSITY_PER_M = 2.0
 """Less density is nothing already: a quarter of the smallest isovalue."""
 DEPTH_TOLERANCE_M = 0.02
 """Distance behind the nearest surface up to which a vertex is visible."""
+
+
+@dataclass(frozen=True)
+class RingEvidence:
+    """What the frames tell of the sides of a skirt, in [0, 1] along the k normals of `ring_normals`.
+
+    outline: that of its outline. depth: its depth, by parallax.
+    """
+
+    outline: Float[np.ndarray, "k"]
+    depth: Float[np.ndarray, "k"]
 
 
 @dataclass(frozen=True)
@@ -120,15 +131,47 @@ def surface_evidence(
         rotation = view.canonical_to_world[nearest_joint, :3, :3]
         total += weight
         direction += weight[:, None] * (towards[:, None] @ rotation)[:, 0]
-    spread = 1.0 - direction.norm(dim=1) / total.clamp_min(1e-12)
     seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
-    depth = ((spread - NO_SPREAD) / (ENOUGH_SPREAD - NO_SPREAD)).clamp(0.0, 1.0)
+    depth = _told_by_parallax(total, direction, ENOUGH_SPREAD)
     told_by_outline = (outline / len(views) / ENOUGH_OUTLINES).clamp(0.0, 1.0)
     evidence = torch.maximum(seen * (1.0 - DEPTH_SHARE * (1.0 - depth)), told_by_outline).numpy()
     if ambiguous_m is None:
         return evidence
     distance_m, _ = cKDTree(ambiguous_m).query(body.vertices)
     return evidence * np.clip((distance_m - AMBIGUOUS_REACH_M) / AMBIGUOUS_FADE_M, 0.0, 1.0)
+
+
+def ring_normals() -> Float[np.ndarray, "k 2"]:
+    """Return horizontal unit normals (x, z): the first along +Z, the others clockwise as seen from above."""
+    angle_rad = 2.0 * np.pi * np.arange(NORMALS) / NORMALS
+    return np.stack([np.sin(angle_rad), np.cos(angle_rad)], axis=1)
+
+
+def ring_evidence(body: Body, views: Sequence[PosedView]) -> RingEvidence:
+    """Return what the views tell of the sides of a skirt, which turns with the hips. views: at least one."""
+    hips, normals = int(np.flatnonzero(body.parents < 0)[0]), torch.from_numpy(ring_normals())
+    total, outline, direction = (normals.new_zeros(shape) for shape in (NORMALS, NORMALS, (NORMALS, 2)))
+    for view in views:
+        pose = view.canonical_to_world[hips].numpy()
+        camera_m = pose[:3, :3].T @ (view.camera.centre_m() - pose[:3, 3])
+        towards = torch.from_numpy((camera_m - body.joints_m[hips])[[0, 2]]).to(normals)
+        towards = torch.nn.functional.normalize(towards, dim=0)
+        cosine = normals @ towards
+        outline += cosine.abs() < OUTLINE_COSINE
+        weight = cosine.clamp_min(0.0).square()
+        total += weight
+        direction += weight[:, None] * towards
+    seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
+    depth = _told_by_parallax(total, direction, ENOUGH_RING_SPREAD) * seen
+    return RingEvidence((outline / len(views) / ENOUGH_OUTLINES).clamp(0.0, 1.0).numpy(), depth.numpy())
+
+
+def _told_by_parallax(
+    total: Float[Tensor, "v"], direction: Float[Tensor, "v d"], enough_spread: float
+) -> Float[Tensor, "v"]:
+    """Return how well depths are told, in [0, 1]. total, direction: sums of weights and of weighted directions."""
+    spread = 1.0 - direction.norm(dim=1) / total.clamp_min(1e-12)
+    return ((spread - NO_SPREAD) / (enough_spread - NO_SPREAD)).clamp(0.0, 1.0)
 
 
 def share_beside_masks(

@@ -5,11 +5,9 @@ hangs from the widest place above it, and a skirt widens on all sides alike. Eac
 convex shape with the support function of what the body has above the slice, moved outwards by as much as the outlines
 of the frames show at the sides. Where they show the outline, it is that of the slice itself.
 
-The support function of a shape is the largest coordinate along each of k horizontal normals, the first of them along
-+Z, the others clockwise as seen from above.
+The support function of a shape is the largest coordinate along each of the k normals of `ring_normals`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,36 +16,15 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
-from pipeline.mesh.extraction.between_legs import SKIRT_ABOVE_CROTCH_M, LegGrid
-from pipeline.mesh.views import PosedView
+from pipeline.mesh.extraction.between_legs import HEM_RANGE_M, SKIRT_ABOVE_CROTCH_M, LegGrid
+from pipeline.mesh.extraction.evidence import NORMALS, RingEvidence, ring_normals
 
-NORMALS = 72
-OUTLINE_COSINE, ENOUGH_OUTLINES = 0.2, 0.15
-"""Largest cosine between a normal and the direction to the camera with which a frame shows the outline there, and the
-share of such frames that is enough. A full turn has 0.13, which tells by parallax."""
-ENOUGH_FACING = 0.05
-"""Mean over frames of the squared cosine from which on a side counts as seen, as for a vertex of the body."""
-NO_SPREAD, ENOUGH_SPREAD = 0.05, 0.12
-"""One minus the length of the mean direction to the camera, weighted by the squared cosines, up to which frames do not
-tell the depth of a side, and from which on they do. A full turn has 0.15, an arc of 90 degrees 0.08, of 40 0.02."""
-HEM_REACH_M = 0.05
-"""Slices are completed as far as they hold both legs, down to this distance below the hem that the masks tell."""
 TOP_FADE_M = 0.1
-"""Below the top, `SKIRT_ABOVE_CROTCH_M`, the completion fades in over this distance."""
+"""Slices are completed from `SKIRT_ABOVE_CROTCH_M` down to the last that holds both legs, at most `HEM_RANGE_M` below
+the told hem. Below the top the completion fades in over this distance."""
 SMOOTHING_M, SMOOTHING_NORMALS = 0.015, 1.4
 """Standard deviations of the smoothing of the support functions, in height and in normals."""
 DEPTH_SMOOTHING_NORMALS = 2.0
-
-
-@dataclass(frozen=True)
-class RingEvidence:
-    """What the frames tell of the sides of a skirt, in [0, 1] along the k normals.
-
-    outline: that of its outline. depth: its depth, by parallax.
-    """
-
-    outline: Float[np.ndarray, "k"]
-    depth: Float[np.ndarray, "k"]
 
 
 @dataclass(frozen=True)
@@ -56,26 +33,6 @@ class CompletedSkirt:
 
     distance_m: Float[np.ndarray, "x y z"]
     share: Float[np.ndarray, "x y z"]
-
-
-def ring_evidence(body: Body, views: Sequence[PosedView]) -> RingEvidence:
-    """Return what the views tell of the sides of a skirt, which turns with the hips. views: at least one."""
-    hips, normals = int(np.flatnonzero(body.parents < 0)[0]), _normals()
-    outline, facing, towards = np.zeros(NORMALS), np.zeros(NORMALS), np.zeros((NORMALS, 2))
-    for view in views:
-        pose = view.canonical_to_world[hips].numpy()
-        camera_m = pose[:3, :3].T @ (view.camera.centre_m() - pose[:3, 3])
-        direction = (camera_m - body.joints_m[hips])[[0, 2]]
-        direction /= np.linalg.norm(direction)
-        cosine = normals @ direction
-        outline += np.abs(cosine) < OUTLINE_COSINE
-        weight = np.maximum(cosine, 0.0) ** 2
-        facing += weight
-        towards += weight[:, None] * direction
-    spread = 1.0 - np.linalg.norm(towards, axis=1) / np.maximum(facing, 1e-12)
-    depth = np.clip((spread - NO_SPREAD) / (ENOUGH_SPREAD - NO_SPREAD), 0.0, 1.0)
-    depth *= np.clip(facing / len(views) / ENOUGH_FACING, 0.0, 1.0)
-    return RingEvidence(np.clip(outline / len(views) / ENOUGH_OUTLINES, 0.0, 1.0), depth)
 
 
 def complete_skirt(
@@ -93,7 +50,7 @@ def complete_skirt(
     if grid.hem_m is None or not grid.middle() or evidence.depth.min() >= 1.0:
         return CompletedSkirt(surface_m, share)
     top_m = grid.crotch_m + SKIRT_ABOVE_CROTCH_M
-    span = slice(grid.row(grid.hem_m - HEM_REACH_M), grid.row(top_m))
+    span = slice(grid.row(grid.hem_m - HEM_RANGE_M), grid.row(top_m))
     is_arm, coordinate_m = _is_arm(grid, body, span), _coordinates_m(grid, span)
     slices = _slices(surface_m, grid, is_arm, coordinate_m, span)
     if not slices.has_ring.any():
@@ -111,16 +68,9 @@ def complete_skirt(
     return CompletedSkirt(distance_m, share)
 
 
-def _normals() -> Float[np.ndarray, "k 2"]:
-    """Return the horizontal unit normals, (x, z)."""
-    angle_rad = 2.0 * np.pi * np.arange(NORMALS) / NORMALS
-    return np.stack([np.sin(angle_rad), np.cos(angle_rad)], axis=1)
-
-
 def _is_arm(grid: LegGrid, body: Body, span: slice) -> Bool[np.ndarray, "x r z"]:
     """Return the samples of some rows that are nearest to an arm or a hand."""
-    arms = [k for k, name in enumerate(body.joint_names) if "Arm" in name or "Hand" in name]
-    is_arm = body.skin_weights[:, arms].sum(axis=1) > 0.5
+    is_arm = body.skin_weights[:, body.arm_joints()].sum(axis=1) > 0.5
     indices = np.argwhere(np.ones_like(grid.body_distance_m[:, span], dtype=bool)) + [0, span.start, 0]
     _, nearest = cKDTree(body.vertices).query(indices * grid.spacing_m + grid.origin_m)
     return np.asarray(is_arm[nearest].reshape(grid.body_distance_m[:, span].shape))
@@ -133,7 +83,7 @@ def _coordinates_m(grid: LegGrid, span: slice) -> Float[np.ndarray, "x z k"]:
     across, _, along = grid.body_distance_m.shape
     axis = np.array([middle, depth.mean() if len(depth) else 0.5 * along])
     samples = np.stack(np.meshgrid(np.arange(across), np.arange(along), indexing="ij"), axis=-1)
-    return np.asarray(grid.spacing_m * (samples - axis) @ _normals().T)
+    return np.asarray(grid.spacing_m * (samples - axis) @ ring_normals().T)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from pipeline.mesh.extraction.skirt_ring import NORMALS, RingEvidence, complete_skirt, ring_evidence
+from pipeline.mesh.extraction.evidence import NORMALS, RingEvidence, ring_evidence
+from pipeline.mesh.extraction.skirt_ring import complete_skirt
 from pipeline.mesh.views import PosedView
 from tests.mesh.extraction.two_legs import LEG_RADIUS_M, LEG_X_M, TRUNK_RADIUS_M, leg_grid
 

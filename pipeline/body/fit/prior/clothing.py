@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 from torch import Tensor
 
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
+from pipeline.body.fit.linear_body import LinearBody
 from pipeline.body.fit.prior.priors import ShapePrior
 from pipeline.body.fit.silhouette_icp import HEAD_AND_FOOT_JOINTS
 
@@ -54,7 +54,7 @@ def clothing_offsets(model: LinearBody) -> Float[Tensor, "v 3 c"]:
     stiffness = -igl.cotmatrix(vertices_m, faces)
     mass = igl.massmatrix(vertices_m, faces, igl.MASSMATRIX_TYPE_VORONOI)
     _, part = connected_components(stiffness)  # eyeballs and teeth are parts of their own
-    is_bare = model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in BARE_JOINTS]].sum(1).numpy() > 0.5
+    is_bare = model.skin_weight_of(BARE_JOINTS).numpy() > 0.5
     dressed = np.flatnonzero((part == np.bincount(part).argmax()) & ~is_bare)
     eigenvalues, harmonics = _lowest_eigenvectors(
         csc_matrix(stiffness[dressed][:, dressed]), csc_matrix(mass[dressed][:, dressed])
