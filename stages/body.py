@@ -344,7 +344,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=38,
+    version=39,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -82,6 +82,16 @@ class LinearBody:
         gradient = self.vertices_shape_jacobian[top, 1] - self.vertices_shape_jacobian[bottom, 1]
         return float(self.vertices_m[top, 1] - self.vertices_m[bottom, 1]), gradient
 
+    def foot_length_m(self) -> tuple[float, Float[Tensor, "s"]]:
+        """Return the length of the left foot of the rest body (m) and its derivative with respect to the shape."""
+        on_foot = torch.nonzero(self.skin_weight_of(("LeftFoot", "LeftToeBase")) > 0.5).squeeze(1)
+        ankle_m, toes_m = (self.joints_m[ACTIVE_JOINTS.index(name)] for name in ("LeftFoot", "LeftToeBase"))
+        forward = torch.nn.functional.normalize((toes_m - ankle_m) * toes_m.new_tensor([1.0, 0.0, 1.0]), dim=0)
+        place_m = self.vertices_m[on_foot] @ forward
+        tip, heel = int(on_foot[place_m.argmax()]), int(on_foot[place_m.argmin()])
+        gradient = forward @ (self.vertices_shape_jacobian[tip] - self.vertices_shape_jacobian[heel])
+        return float(place_m.max() - place_m.min()), gradient
+
 
 def linearise_body(
     body: ParametricBody, shape: Float[Tensor, "s"], curls_rad: Float[np.ndarray, "2 4"] | None = None

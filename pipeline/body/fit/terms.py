@@ -37,6 +37,8 @@ from pipeline.body.fit.posed_points import (
     surface_points,
 )
 from pipeline.body.fit.prior.priors import (
+    FOOT_LENGTH_RATIO,
+    FOOT_LENGTH_RATIO_STD,
     PosePrior,
     ShapePrior,
     acceleration_factors,
@@ -256,7 +258,7 @@ class MotionTerm:
 
 @dataclass(frozen=True)
 class SharedPriorTerm:
-    """Priors on shape, stature, landmark offsets and intrinsics.
+    """Priors on shape, stature, length of the feet over the stature, landmark offsets and intrinsics.
 
     intrinsics_std: of the intrinsics delta (principal point in focal lengths, logarithm of the focal length).
     """
@@ -271,7 +273,7 @@ class SharedPriorTerm:
         """Add cost, gradient and Gauss-Newton Hessian at a state; nothing if there are no shared parameters."""
         if not at.has_shared:
             return
-        state, shape_count = at.state, len(at.state.shape)
+        state = at.state
         std = torch.cat(
             [
                 self.shape_prior.std,
@@ -283,12 +285,22 @@ class SharedPriorTerm:
         system.cost += float(value.square().sum())
         system.shared_hessian += torch.diag(std**-2)
         system.shared_gradient += value / std
-        height_m, gradient = at.model.height_m()
-        gradient = gradient / self.height_std_m
-        residual = (height_m - self.height_m) / self.height_std_m
-        system.cost += residual**2
-        system.shared_hessian[:shape_count, :shape_count] += torch.outer(gradient, gradient)
-        system.shared_gradient[:shape_count] += gradient * residual
+        height_m, height_gradient = at.model.height_m()
+        foot_m, foot_gradient = at.model.foot_length_m()
+        ratio = foot_m / height_m
+        ratio_gradient = (foot_gradient - ratio * height_gradient) / height_m
+        _add_measure(system, (height_m - self.height_m) / self.height_std_m, height_gradient / self.height_std_m)
+        _add_measure(
+            system, (ratio - FOOT_LENGTH_RATIO) / FOOT_LENGTH_RATIO_STD, ratio_gradient / FOOT_LENGTH_RATIO_STD
+        )
+
+
+def _add_measure(system: NormalEquations, residual: float, gradient: Float[Tensor, "s"]) -> None:
+    """Add the residual of a measure of the rest body and its derivative with respect to the shape."""
+    shape = slice(len(gradient))
+    system.cost += residual**2
+    system.shared_hessian[shape, shape] += torch.outer(gradient, gradient)
+    system.shared_gradient[shape] += gradient * residual
 
 
 def face_landmark_confidence(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n l"]:

@@ -15,12 +15,13 @@ from pipeline.body.fit.detections.landmarks_3d import (
 from pipeline.body.fit.energy import VERTICAL_PRINCIPAL_POINT_RATIO, EnergyParameters, Objective, compute_px_per_m
 from pipeline.body.fit.initialisation import solve_root_position
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.levenberg_marquardt import NormalEquations
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
 from pipeline.body.fit.posed_points import pose_skeleton
 from pipeline.body.fit.prior.priors import default_motion_std, pose_prior, shape_prior
 from pipeline.body.fit.silhouette_icp import match_silhouettes
 from pipeline.body.fit.state import FitState
-from pipeline.body.fit.terms import face_landmark_confidence
+from pipeline.body.fit.terms import SharedPriorTerm, face_landmark_confidence
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.body.acting import synthetic_recording
 
@@ -70,6 +71,25 @@ def test_gradient_agrees_with_differences_of_the_cost(parameters: EnergyParamete
     slope = 2.0 * float((system.frame_gradient * frame_step).sum() + system.shared_gradient @ shared_step)
     # the shape derivative of a surface point is that of the nearest vertex, hence the tolerance
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
+
+
+def test_gradient_of_the_shared_priors_agrees_with_differences_of_their_cost() -> None:
+    """With feet longer than those of anyone; their direction counts as constant, hence the tolerance."""
+    objective, state = build(EXACT, outlines=False)
+    (prior,) = (term for term in objective._prior_terms() if isinstance(term, SharedPriorTerm))
+    shape = state.shape.clone()
+    shape[load_anny().shape_names.index("foot-size")] = 0.6
+    count = len(shape) + LANDMARK_OFFSET_COUNT + INTRINSICS_COUNT
+
+    def evaluate(of_shape: torch.Tensor) -> NormalEquations:
+        system = NormalEquations.zeros(FRAMES, NUMBERS, count)
+        prior.add_to(system, objective._linearise(replace(state, shape=of_shape)))
+        return system
+
+    step = 1e-6 * torch.randn(len(shape), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    slope = 2.0 * float(evaluate(shape).shared_gradient[: len(shape)] @ step)
+    assert evaluate(shape + step).cost - evaluate(shape - step).cost == pytest.approx(2.0 * slope, rel=2e-3)
+    assert float(evaluate(shape).shared_gradient[load_anny().shape_names.index("foot-size")]) > 10.0
 
 
 def test_chunks_of_frames_do_not_change_the_system(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,18 @@ def test_linear_body_approximates_the_body(model: LinearBody) -> None:
     assert height + float(gradient @ (shape.double() - model.shape)) == pytest.approx(exact.height_m()[0], abs=2e-3)
 
 
+def test_foot_length_is_that_of_the_vertices_of_the_foot_and_follows_its_size(model: LinearBody) -> None:
+    length_m, gradient = model.foot_length_m()
+    feet_m = model.vertices_m[model.vertices_m[:, 1] < model.vertices_m[:, 1].min() + 0.03]
+    left_m = feet_m[feet_m[:, 0] > 0.0][:, [0, 2]]
+    assert length_m == pytest.approx(float(torch.cdist(left_m, left_m).max()), rel=0.03)
+    step = torch.zeros_like(model.shape)
+    step[load_anny().shape_names.index("foot-size")] = 0.3
+    larger_m = model.at_shape(model.shape + step).foot_length_m()[0]
+    assert larger_m > length_m + 0.01
+    assert length_m + float(gradient @ step) == pytest.approx(larger_m, abs=1e-3)
+
+
 def test_skin_weights_of_fingers_are_merged_into_the_hand(model: LinearBody) -> None:
     assert torch.allclose(
         model.skin_weights.sum(1), torch.ones(len(model.skin_weights), dtype=torch.float64), atol=1e-5
