@@ -197,7 +197,7 @@ def write_preview(path: Path, renders: list[np.ndarray], validator: Validator) -
 
 STAGE = Stage(
     "field",
-    version=19,
+    version=20,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

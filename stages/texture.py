@@ -317,7 +317,7 @@ def make_texel_inpainter(
 
 STAGE = Stage(
     "texture",
-    version=20,
+    version=21,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

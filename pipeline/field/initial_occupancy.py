@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.field.occupancy import RESOLUTION, cell_centres
+from pipeline.field.skin_grid import smooth_skin_weights
 from pipeline.geometry.camera import Camera, project, project_to_pixels
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
@@ -28,6 +29,8 @@ OFFSET_PER_MASK_DISTANCE = 2.0
 """Clothing offset relative to the distance from the outline, which a leg before or behind the cloth reduces."""
 MASK_STRIDE_PX = 4
 """Every fourth row and column of a mask is used."""
+SKIRT_SPACING_M = 0.03
+"""Spacing of the points at which masks tell how far a skirt reaches."""
 MIN_RESULTANT_LENGTH = 0.75
 """Length of the mean unit direction above which all directions come from one side: that of an arc of 145 degrees.
 
@@ -53,10 +56,11 @@ def estimate_clothing_offset_m(
     """Estimate the largest distance of clothing from the body, m, from the masks.
 
     The distance of a mask is the 99th percentile over its pixels of the distance to the nearest projected vertex, in
-    metres at the depth of that vertex. The result is twice the median over frames, clamped to
-    [`min_offset_m`, `max_offset_m`]; `min_offset_m` wins if it is larger.
+    metres at the depth of that vertex; with a skirt or coat, over the pixels nearest to vertices in it. The result is
+    twice the median over frames, clamped to [`min_offset_m`, `max_offset_m`]; `min_offset_m` wins if it is larger.
     """
     vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
+    counts = np.ones(len(body.vertices), dtype=bool) if body.hem_m is None else _is_in_skirt(body, body.hem_m)
     mask_distances_m = []
     for pose, mask in zip(canonical_to_world, masks, strict=True):
         posed = linear_blend_skinning(vertices, weights, pose[None])[0]
@@ -65,11 +69,48 @@ def estimate_clothing_offset_m(
         mask_px = MASK_STRIDE_PX * np.argwhere(mask[::MASK_STRIDE_PX, ::MASK_STRIDE_PX])[:, ::-1] + 0.5
         if len(mask_px) and in_front.any():
             distance_px, nearest = cKDTree(pixels[in_front]).query(mask_px)
-            mask_distances_m.append(
-                np.quantile(distance_px * depth_m[in_front][nearest] / camera.fx, MASK_DISTANCE_QUANTILE)
-            )
+            distance_m = (distance_px * depth_m[in_front][nearest] / camera.fx)[counts[in_front][nearest]]
+            if len(distance_m):
+                mask_distances_m.append(np.quantile(distance_m, MASK_DISTANCE_QUANTILE))
     mask_distance_m = float(np.median(mask_distances_m)) if mask_distances_m else 0.0
     return max(min_offset_m, min(max_offset_m, OFFSET_PER_MASK_DISTANCE * mask_distance_m))
+
+
+def skirt_reach_m(
+    body: Body,
+    canonical_to_world: Float[Tensor, "k j 4 4"],
+    camera: Camera,
+    masks: list[Bool[np.ndarray, "h w"]],
+    max_reach_m: float,
+    min_mask_fraction: float,
+) -> float | None:
+    """Return the distance from the body, m, of the farthest point of a skirt or coat that enough masks contain.
+
+    In front of the gap between the legs cloth is farther from them than any outline shows. None without a hem, and if
+    frames show the legs in the skirt from one side only: masks then contain points at any depth.
+
+    max_reach_m: of the points that are tried. min_mask_fraction: as in `initial_occupancy`.
+    """
+    if body.hem_m is None:
+        return None
+    of_body = torch.from_numpy(body.skin_weights[_is_in_skirt(body, body.hem_m)])
+    if observed_from_one_side(body.joints_m, of_body, canonical_to_world, camera).any():
+        return None
+    low_m, high_m = body.vertices.min(0) - max_reach_m, body.vertices.max(0) + max_reach_m
+    low_m[1], high_m[1] = body.hem_m, body.height_on_legs_m(0.0)
+    axes_m = [np.arange(low, high, SKIRT_SPACING_M) for low, high in zip(low_m, high_m, strict=True)]
+    points_m = np.stack(np.meshgrid(*axes_m, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+    distance_m, _ = cKDTree(body.vertices).query(points_m, distance_upper_bound=max_reach_m)
+    points_m, distance_m = points_m[np.isfinite(distance_m)], distance_m[np.isfinite(distance_m)]
+    weights = torch.from_numpy(smooth_skin_weights(points_m, body))
+    of_masks = [mask.astype(np.uint8) for mask in masks]
+    fraction = project_mask_fraction(points_m, distance_m, weights, canonical_to_world, camera, of_masks)
+    return float(distance_m[fraction >= min_mask_fraction].max(initial=0.0))
+
+
+def _is_in_skirt(body: Body, hem_m: float) -> Bool[np.ndarray, "v"]:
+    """Return the vertices from the hem up to the hip joints."""
+    return (body.vertices[:, 1] > hem_m) & (body.vertices[:, 1] < body.height_on_legs_m(0.0))
 
 
 def cell_signed_distances_m(

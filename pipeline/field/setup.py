@@ -24,9 +24,11 @@ from pipeline.field.initial_occupancy import (
     initial_occupancy,
     observed_from_one_side,
     project_mask_fraction,
+    skirt_reach_m,
 )
 from pipeline.field.occupancy import CellData, OccupancyGrid, cell_centres
 from pipeline.field.pixel_sampler import build_pixel_pool
+from pipeline.field.settings import FieldSettings
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.field.trainer import Trainer, TrainingScene
 from pipeline.geometry.camera import Camera, transform_world_to_camera
@@ -76,14 +78,7 @@ def create_trainer(
     rows = evenly_spaced(len(masked_images), MASK_FRAMES)
     masks = [masked_images[row][1] >= 128 for row in rows]
     posed_masks = MaskedPoses(canonical_to_world(body, motion.select(rows)), camera, masks)
-    clothing_offset_m = estimate_clothing_offset_m(
-        body,
-        posed_masks.canonical_to_world,
-        camera,
-        masks,
-        settings.min_clothing_offset_m,
-        settings.max_clothing_offset_m,
-    )
+    clothing_offset_m = find_clothing_offset_m(body, posed_masks, settings)
     bounds_m = field_bounds_m(body, clothing_offset_m)
     skin = build_skin_grid(body, skin_margin_m(body, bounds_m))
     pixel_m = median_root_depth_m(motion, camera) / camera.fy
@@ -95,6 +90,16 @@ def create_trainer(
     scene = TrainingScene(body, motion, camera, pool, skin)
     field = initial_field(scene, masked_images, bounds_m, pixel_m, config).to(device)
     return Trainer(scene, field, occupancy, config)
+
+
+def find_clothing_offset_m(body: Body, posed_masks: MaskedPoses, settings: FieldSettings) -> float:
+    """Return the largest distance of clothing from the body, m, within the range of the settings."""
+    of_masks = posed_masks.canonical_to_world, posed_masks.camera, posed_masks.masks
+    largest_m = settings.max_clothing_offset_m
+    reach_m = skirt_reach_m(body, *of_masks, largest_m, settings.initial_min_mask_fraction)
+    if reach_m is None:
+        return estimate_clothing_offset_m(body, *of_masks, settings.min_clothing_offset_m, largest_m)
+    return max(settings.min_clothing_offset_m, reach_m)
 
 
 def initial_cells(

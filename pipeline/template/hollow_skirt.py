@@ -56,6 +56,9 @@ above its lowest place."""
 ON_CAVITY_M = 0.001
 """Vertices up to this distance from the cavity are on it."""
 
+FLOOR_M = 0.008
+"""The floor of the cavity is flat to this height: one sample."""
+
 MAX_LINING_M = 0.02
 """Distance of a vertex inside from the outer side up to which both are sides of one cloth."""
 
@@ -133,8 +136,12 @@ def cut_out(mesh: Mesh, cavity: Mesh, max_faces: int | None = None) -> Mesh:
 
 
 def vertices_inside(mesh: Mesh, cavity: Mesh) -> Bool[np.ndarray, "v"]:
-    """Return which vertices of a mesh from `cut_out` are on the cavity: the lining, and the legs in the garment."""
-    return closest_points_on_mesh(mesh.vertices, cavity)[0] < ON_CAVITY_M
+    """Return which vertices of a mesh from `cut_out` are on the cavity: the lining, and the legs in the garment.
+
+    Its floor below the hem leaves a ledge around the filmed legs, which is part of them.
+    """
+    above_floor = mesh.vertices[:, 1] > cavity.vertices[:, 1].min() + FLOOR_M
+    return above_floor & (closest_points_on_mesh(mesh.vertices, cavity)[0] < ON_CAVITY_M)
 
 
 def hollow_skin(

@@ -185,7 +185,7 @@ def _loose_faces(
     loose &= _in_large_pieces(surface, loose)
     for _ in range(_LOOSE_RINGS):
         near = np.zeros(len(surface.vertices), dtype=bool)
-        near[surface.faces[loose]] = True
+        near[surface.faces[loose & ~inside]] = True
         loose |= near[surface.faces].any(axis=1)
     for number in np.unique(chart_of_face):
         rows = np.flatnonzero((chart_of_face == number) & ~loose)

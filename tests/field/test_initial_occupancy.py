@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
 from pipeline.field.initial_occupancy import (
@@ -10,6 +13,7 @@ from pipeline.field.initial_occupancy import (
     initial_occupancy,
     observed_from_one_side,
     project_mask_fraction,
+    skirt_reach_m,
 )
 from pipeline.field.occupancy import cell_centres
 from pipeline.geometry.camera import Camera
@@ -126,3 +130,57 @@ def test_a_minority_of_wrong_or_empty_masks_does_not_change_the_offset():
     assert offset_of_discs([DISC_M, DISC_M, DISC_M, 0.75, 0.75]) == 0.05
     assert offset_of_discs([0.5, 0.0, 0.0, 0.0]) == offset_of_discs([0.5])
     assert offset_of_discs([0.0]) == 0.05
+
+
+def test_with_a_skirt_the_offset_is_that_of_the_pixels_beside_it(body):
+    """A mask that is 12 cm wider than the body at the hem, a small part of it, and 3 cm elsewhere."""
+    low, far = replace(body, hem_m=0.45), LOOKING_BACK.copy()
+    far[1, 3], far[2, 3] = 0.9, 50.0
+    camera = Camera(5000.0, 5000.0, 100.0, 100.0, 200, 200, far.astype(np.float32))
+    column, row = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
+    to_body_m = cKDTree(body.vertices[:, :2]).query(np.stack([column / 100 - 1.0, 1.9 - row / 100], axis=-1))[0]
+    mask = to_body_m < np.where(np.abs(1.9 - row / 100 - 0.47) < 0.02, 0.12, 0.03)
+    poses = torch.eye(4).expand(1, len(body.joint_names), 4, 4)
+    offset_m = estimate_clothing_offset_m(low, poses, camera, [mask], 0.0, 1.0)
+    assert 0.12 < offset_m < 2 * 0.12
+    assert estimate_clothing_offset_m(body, poses, camera, [mask], 0.0, 1.0) < 0.12
+
+
+def reach_of_a_cylinder(body, radius_m, arc_deg=360.0, max_reach_m=0.5):
+    """Reach of an upright cylinder around the legs from a far camera, and the truth; a pixel is 1 cm."""
+    body = replace(body, hem_m=0.45)
+    angle = np.radians(arc_deg) * (np.arange(24) / 24 - 0.5)
+    poses = torch.eye(4).repeat(24, len(body.joint_names), 1, 1)
+    poses[..., 0, 0] = poses[..., 2, 2] = torch.from_numpy(np.cos(angle))[:, None]
+    poses[..., 0, 2] = torch.from_numpy(np.sin(angle))[:, None]
+    poses[..., 2, 0] = -poses[..., 0, 2]
+    far = LOOKING_BACK.copy()
+    far[1, 3], far[2, 3] = 0.9, 50.0
+    camera = Camera(5000.0, 5000.0, 100.0, 100.0, 200, 200, far.astype(np.float32))
+    mask = np.broadcast_to(np.abs(np.arange(200) + 0.5 - 100) < 100 * radius_m, (200, 200))
+    grid = np.stack(np.meshgrid(*2 * [np.arange(-radius_m, radius_m, 0.02)]), axis=-1).reshape(-1, 2)
+    grid = grid[np.linalg.norm(grid, axis=1) < radius_m]
+    heights_m = np.arange(0.45, body.height_on_legs_m(0.0), 0.02)
+    inside = np.concatenate([np.insert(grid, 1, height_m, axis=1) for height_m in heights_m])
+    truth_m = cKDTree(body.vertices).query(inside)[0].max()
+    return skirt_reach_m(body, poses, camera, [mask] * 24, max_reach_m, 0.95), truth_m
+
+
+def test_a_skirt_reaches_as_far_as_masks_from_all_sides_contain_points(body):
+    """Round cloth is farther from the legs in front of their gap than at the sides."""
+    for radius_m in (0.3, 0.4):
+        reach_m, truth_m = reach_of_a_cylinder(body, radius_m)
+        assert truth_m > radius_m - 0.15
+        assert reach_m == pytest.approx(truth_m, abs=0.04)
+    assert reach_of_a_cylinder(body, 0.4, max_reach_m=0.15)[0] == pytest.approx(0.15, abs=0.01)
+    assert reach_of_a_cylinder(body, 0.4, max_reach_m=0.0)[0] == 0.0
+
+
+def test_one_side_tells_no_reach_of_a_skirt(body):
+    assert reach_of_a_cylinder(body, 0.3, arc_deg=90.0)[0] is None
+
+
+def test_without_a_hem_there_is_no_skirt(body):
+    camera = Camera(100.0, 100.0, 20.0, 20.0, 40, 40, LOOKING_BACK.astype(np.float32))
+    mask, poses = np.ones((40, 40), dtype=bool), torch.eye(4).expand(1, len(body.joint_names), 4, 4)
+    assert skirt_reach_m(body, poses, camera, [mask], 0.5, 0.6) is None

@@ -104,6 +104,16 @@ def test_cloth_has_a_thickness_and_its_outside_stays() -> None:
     assert np.quantile(np.abs(thickness_m - THICKNESS_M), 0.95) < 0.01
 
 
+def test_the_ledge_around_the_filmed_legs_is_not_inside() -> None:
+    """The floor of the cavity is below the hem, where frames show the legs."""
+    found, inside = hollow(0.02)
+    centre_m = found.vertices[found.faces].mean(axis=1)
+    ledge = (found.face_normals()[:, 1] > 0.9) & (centre_m[:, 1] < HEM_M - 0.02) & (centre_m[:, 1] > 0.3)
+    assert ledge.sum() > 10
+    assert not inside[found.faces[ledge]].all(axis=1).any()
+    assert inside[found.vertices[:, 1] > HEM_M].any()
+
+
 def hidden_legs(body: Body) -> np.ndarray:
     """The vertices of legs in the skirt that are not between the thighs."""
     names = ("LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg")

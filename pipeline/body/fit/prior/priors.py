@@ -74,8 +74,8 @@ LOCAL_CHANGE_STD = 0.3
 """Standard deviation of shape parameters that are no phenotypes: local changes about 0."""
 
 FOOT_LENGTH_RATIO, FOOT_LENGTH_RATIO_STD = 0.158, 0.006
-"""Mean and standard deviation of the length of a foot over the stature: 0.15 without shoes (Fessler, Haley and Lal,
-"Sexual dimorphism in foot length proportionate to stature", 2005), which add 1 to 2 cm. Frontal views hardly tell it."""
+"""Mean and standard deviation of a foot's length over the stature: 0.15 without shoes, which add 1 to 2 cm (Fessler,
+Haley and Lal, "Sexual dimorphism in foot length proportionate to stature", 2005). Frontal views hardly tell it."""
 
 BETA_STD = 1.0
 """Standard deviation of SMPL betas, which are principal components scaled to unit variance."""
