@@ -381,7 +381,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=53,
+    version=54,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -295,7 +295,7 @@ def make_texel_inpainter(
     is_inside = np.zeros(len(mesh.vertices), dtype=bool) if skinned.is_inside is None else skinned.is_inside
     lining = find_lining(mesh, is_inside)
     slices = BodySlices.of_vertices(mesh.vertices, skinned.joint_indices, skinned.joint_weights, body)
-    slices = slices.without(is_inside)
+    slices = slices.of_hollow_skirt(mesh.vertices[:, 1], is_inside, lining.hem_m(mesh.vertices))
     if template is not None:
         partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
@@ -317,7 +317,7 @@ def make_texel_inpainter(
 
 STAGE = Stage(
     "texture",
-    version=21,
+    version=22,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

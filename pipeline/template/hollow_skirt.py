@@ -62,6 +62,9 @@ FLOOR_M = 0.008
 MAX_LINING_M = 0.02
 """Distance of a vertex inside from the outer side up to which both are sides of one cloth."""
 
+HEM_QUANTILE = 0.05
+"""Quantile of the heights of a lining that is its lower edge."""
+
 EDGE_RATIO, TOLERANCE_M = 6.0, 0.003
 """Edge length of the cavity, in edge lengths of the mesh; and the distance by which longer edges may move it."""
 
@@ -82,6 +85,10 @@ class Lining:
     def of_outer_side(self, values: Float[np.ndarray, "v c"]) -> Float[np.ndarray, "k c"]:
         """Return the values of vertices on the outer side for the vertices of the lining."""
         return np.asarray(np.einsum("kn,knc->kc", self.barycentric, values[self.corners]))
+
+    def hem_m(self, vertices_m: Float[np.ndarray, "v 3"]) -> float:
+        """Return the height of its lower edge; below everything without a lining."""
+        return float(np.quantile(vertices_m[self.vertices, 1], HEM_QUANTILE)) if len(self.vertices) else -np.inf
 
 
 def find_lining(mesh: Mesh, is_inside: Bool[np.ndarray, "v"]) -> Lining:

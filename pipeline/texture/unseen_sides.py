@@ -4,7 +4,7 @@ Hems go around a body, and hair around a head. Harmonic interpolation fills smal
 person who was filmed from in front a mixture of shirt, trousers, skin and hair.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -62,7 +62,8 @@ _AXES = {
 class BodySlices:
     """Where vertices are along the axes of body parts.
 
-    part: index into `BODY_PARTS`. along_m: distance along its axis from its lowest vertex; nan: none, as for hands.
+    part: index into `BODY_PARTS`; larger by their number below a hem. along_m: distance along its axis from its lowest
+    vertex; nan: none, as for hands.
     """
 
     part: Int[np.ndarray, "v"]
@@ -91,9 +92,15 @@ class BodySlices:
                 along_m[rows] -= along_m[rows].min()
         return cls(part, along_m)
 
-    def without(self, vertices: Bool[np.ndarray, "v"]) -> "BodySlices":
-        """Return the slices without some vertices, such as those inside of a skirt: its outside does not tell them."""
-        return replace(self, along_m=np.where(vertices, np.nan, self.along_m))
+    def of_hollow_skirt(
+        self, heights_m: Float[np.ndarray, "v"], is_inside: Bool[np.ndarray, "v"], hem_m: float
+    ) -> "BodySlices":
+        """Return the slices of a person in a hollow skirt: its outside does not tell its inside, nor legs its cloth.
+
+        hem_m: height below which the outside is that of the legs.
+        """
+        part = self.part + len(BODY_PARTS) * (heights_m < hem_m)
+        return BodySlices(part, np.where(is_inside, np.nan, self.along_m))
 
 
 @dataclass(frozen=True)
@@ -161,7 +168,7 @@ def find_slice_colours(
     of_part, seen = {}, weight > OBSERVED
     has_slice = np.isfinite(slices.along_m)
     is_far = cKDTree(vertices_m[seen]).query(vertices_m)[0] > HOLE_M if seen.any() else ~has_slice
-    for part in range(len(BODY_PARTS)):
+    for part in np.unique(slices.part[has_slice]).tolist():
         rows = (slices.part == part) & has_slice
         unseen, known = np.flatnonzero(rows & is_far & (weight < UNSEEN)), np.flatnonzero(rows & seen)
         if not len(unseen) or not len(known):

@@ -134,9 +134,26 @@ def test_what_is_inside_of_a_skirt_takes_no_colour_of_its_slice() -> None:
     vertices, angle_deg, _, slices = pillar()
     inside = angle_deg > 150.0
     seen = filmed(angle_deg < 90.0, np.broadcast_to(RED, vertices.shape))
-    _, weight = add_slice_colours(vertices, slices.without(inside), *seen)
+    hollow = slices.of_hollow_skirt(vertices[:, 1], inside, -np.inf)
+    _, weight = add_slice_colours(vertices, hollow, *seen)
     assert np.all(weight[inside] == 0.0)
     assert np.all(weight[(angle_deg > 120.0) & ~inside] == SLICE_WEIGHT)
+
+
+def test_cloth_and_the_legs_below_its_hem_have_colours_of_their_own() -> None:
+    """The axis of a leg is inclined: a slice across the hem has more of the red leg than of the blue cloth."""
+    vertices, angle_deg, _, slices = pillar()
+    hem_m = float(np.median(vertices[:, 1]))
+    inclined = replace(slices, along_m=slices.along_m + 0.2 * (vertices[:, 0] - vertices[:, 0].min()))
+    is_cloth, unseen = vertices[:, 1] >= hem_m, angle_deg > 120.0
+    seen = filmed(angle_deg < 90.0, np.where(is_cloth[:, None], BLUE, RED))
+
+    def wrong(of: BodySlices) -> float:
+        colour, _ = add_slice_colours(vertices, of, *seen)
+        return float((np.abs(colour - np.where(is_cloth[:, None], BLUE, RED)).sum(axis=1) > 0.5)[unseen].mean())
+
+    assert wrong(inclined) > 0.01
+    assert wrong(inclined.of_hollow_skirt(vertices[:, 1], np.zeros(len(vertices), dtype=bool), hem_m)) == 0.0
 
 
 def test_hands_and_people_whom_no_frame_shows_stay_as_they_are() -> None:

@@ -8,7 +8,7 @@ standard deviation is a fraction of the local thickness, and added to the signed
 Where few frames show the surface (`pipeline.mesh.extraction.evidence`) the density is arbitrary. There the offset is
 that of what is seen around it, farther away the less is seen: a normalised convolution (Knutsson and Westin,
 "Normalized and differential convolution", 1993). What no frame shows is thus as far off the body as what is seen beside
-it. A skirt is completed before (`pipeline.mesh.extraction.skirt_ring`).
+it. A skirt is completed before (`pipeline.mesh.extraction.skirt_ring`); what is added is smooth, and keeps its hem.
 
 Hands and the skin of the head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed
 in the same way first, because cloth and hair do not show them. In the face the offset is smoothed over a fixed length.
@@ -111,6 +111,8 @@ def fair_surface(
     value_m = upsample(offset_m, shape)
     value_m *= 1.0 - samples.hand_weight
     value_m += upsample(reference_m, shape)
+    if skirt.share.any():
+        value_m += upsample(skirt.share, shape) * (upsample(skirt.distance_m, shape) - value_m)
     value_m = close_valleys(value_m, samples)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)

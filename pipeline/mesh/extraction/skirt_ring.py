@@ -25,6 +25,8 @@ the told hem. Below the top the completion fades in over this distance."""
 SMOOTHING_M, SMOOTHING_NORMALS = 0.015, 1.4
 """Standard deviations of the smoothing of the support functions, in height and in normals."""
 DEPTH_SMOOTHING_NORMALS = 2.0
+STRAIGHT_M = 0.12
+"""Slices become no narrower over this height above the told hem: one that moves from frame to frame has no edge."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ def complete_skirt(
     if not slices.has_ring.any():
         return CompletedSkirt(surface_m, share)
     rows, support_m = np.arange(span.start, span.stop)[slices.has_ring], slices.completed_m(evidence, grid.spacing_m)
+    at_hem = rows <= grid.row(grid.hem_m + STRAIGHT_M)
+    support_m[at_hem] = np.maximum.accumulate(support_m[at_hem][::-1], axis=0)[::-1]
     told = ndimage.gaussian_filter1d(evidence.depth, DEPTH_SMOOTHING_NORMALS, mode="wrap")
     untold = 1.0 - told[coordinate_m.argmax(axis=-1)]
     height_m, distance_m = grid.origin_m[1] + grid.spacing_m * rows, surface_m.copy()

@@ -10,8 +10,12 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.geometry.surface import is_closed_manifold
+from pipeline.mesh.extraction import fairing
+from pipeline.mesh.extraction.between_legs import LegGrid
+from pipeline.mesh.extraction.evidence import RingEvidence
 from pipeline.mesh.extraction.fairing import SIGMAS_M, fair_surface, local_thickness_m, smooth_with_local_sigma
 from pipeline.mesh.extraction.isosurface import extract_mesh, sample_canonical_grid
+from pipeline.mesh.extraction.skirt_ring import CompletedSkirt
 from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, capsule_body, capsule_distance
 from tests.mesh.full_evidence import full_evidence
 
@@ -109,6 +113,24 @@ def test_what_no_frame_shows_is_as_far_off_the_body_as_what_is_seen_beside_it(bo
     assert min(height_m[0]) > 0.03
     assert height_m[1][0] < 0.008
     assert height_m[1][1] > 0.015
+
+
+def test_a_completed_skirt_keeps_its_edges(body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cube around the middle of the capsule takes the place of what the frames show."""
+    middle_m, half_m = 0.5 * (body.vertices.min(axis=0) + body.vertices.max(axis=0)), RADIUS_M + 0.06
+
+    def complete(surface_m: np.ndarray, grid: LegGrid, body: Body, evidence: RingEvidence) -> CompletedSkirt:
+        points_m = np.moveaxis(np.indices(surface_m.shape), 0, -1) * grid.spacing_m + grid.origin_m
+        cube_m = np.abs(points_m - middle_m).max(axis=-1) - half_m
+        share = (cube_m < 0.03).astype(float)
+        return CompletedSkirt(np.where(share > 0.0, cube_m, surface_m), share)
+
+    monkeypatch.setattr(fairing, "complete_skirt", complete)
+    samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
+    rough = extract_mesh(samples, 100.0, WITHOUT_HANDS)
+    fair = fair_surface(rough, samples, body, body.mesh(), full_evidence(body), WITHOUT_HANDS)
+    corner_m = middle_m + half_m
+    assert np.linalg.norm(fair.vertices - corner_m, axis=1).min() < 0.014
 
 
 def test_hands_keep_the_shape_of_the_body(body: Body) -> None:

@@ -73,6 +73,20 @@ def test_a_back_that_collapsed_is_as_far_off_as_the_sides() -> None:
     assert completed.share[column, grid.row(0.3), 0] == 1.0
 
 
+def test_a_hem_that_moves_from_frame_to_frame_is_as_wide_as_the_skirt_above_it() -> None:
+    """Over 6 cm it narrows to the legs where no depth is told; what frames tell of the front stays narrow."""
+    grid, (x, y, z) = leg_grid(hem_m=HEM_M, spacing_m=0.01)
+    cone_m = np.hypot(x, z) - TRUNK_RADIUS_M - WIDENING_M * np.clip((0.5 - y) / 0.3, 0.0, 1.0)
+    rounding_m = 0.08 * np.clip((HEM_M + 0.06 - y) / 0.06, 0.0, 1.0)
+    surface_m = np.minimum(grid.body_distance_m, cone_m + rounding_m)
+    surface_m = np.where(y < HEM_M, grid.body_distance_m, surface_m)
+    after_m = complete_skirt(surface_m, grid, body_with_an_arm(), from_one_side()).distance_m
+    column, above, at_hem = grid.middle(), grid.row(HEM_M + 0.08), grid.row(HEM_M + 0.01)
+    assert radius_m(surface_m, z, column, at_hem)[0] < radius_m(surface_m, z, column, above)[0] - 0.02
+    assert radius_m(after_m, z, column, at_hem)[0] > radius_m(after_m, z, column, above)[0] - 0.011
+    assert radius_m(after_m, z, column, at_hem)[1] == radius_m(surface_m, z, column, at_hem)[1]
+
+
 def test_a_bulge_in_front_whose_depth_is_not_told_goes() -> None:
     grid, (x, y, z) = leg_grid(hem_m=HEM_M, spacing_m=0.01)
     true_m = np.minimum(grid.body_distance_m, skirt_m(x, y, z))
