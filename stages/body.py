@@ -113,7 +113,7 @@ def run(
     result = fit_capture(capture, hands, windows, config, settings, out)
     legs = leg_profile_of(result, capture, windows)
     hem, motion = legs.hem_height(), motion_of(result, capture)
-    hem_of_skirt = hem if legs.stands_off() and capture.smpl_poses is None else None
+    hem_of_skirt = hem if legs.stands_off() and not result.shape_is_supplied else None
     # The first body fills a skirt: it tells what is no cloth, and how well the frames fit.
     poses = canonical_to_world(result.body, motion)
     blob_shares = residual_blob_shares(result.body, poses, result.camera, windows, hem_of_skirt)
@@ -203,7 +203,7 @@ def fit_capture(
     """Fit the body to a capture and check the quality of the fit, but for that of a body below a skirt.
 
     hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`. out: folder of the
-    checkpoints; None: none. hem: of a skirt that stands off the legs, see `FitOptions`.
+    checkpoints; None: none. hem: of a skirt that stands off the legs, see `FitOptions`; without supplied poses.
 
     Raises:
         UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
@@ -226,7 +226,9 @@ def fit_capture(
         settings,
     )
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
-    supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
+    supplied = None
+    if hem is None:
+        supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
         if supplied is None:
             curls_rad = finger_curls_rad(model, hands)
@@ -344,7 +346,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=39,
+    version=40,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

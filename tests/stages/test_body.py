@@ -24,6 +24,7 @@ from pipeline.capture.capture import (
     mask_path,
     save_capture,
 )
+from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.core.stage import CHECKPOINT_PREFIX
@@ -32,6 +33,7 @@ from pipeline.io.image import read_rgb, write_gray, write_rgb
 from stages.body import STAGE, Config, check_fit_quality, fit_capture, initial_camera, read_mask_windows, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
+from tests.capture.test_smpl_poses import make_poses
 
 FRAMES = 8
 
@@ -114,8 +116,9 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
 
 
 def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene: SyntheticRecording) -> None:
-    """The frames keep the IoU of the first fit, which fills the skirt."""
+    """The frames keep the IoU of the first fit, which fills the skirt. Ignored poses change nothing."""
     write_capture(tmp_path / "frames", scene, scene.camera, scene.masks())
+    save_smpl_poses(tmp_path / "frames" / "smpl_poses.npz", make_poses(FRAMES))
     (tmp_path / "body").mkdir()
     margin_m = np.where(HEIGHTS < 0.9, 0.12, 0.0)
     skirt = LegProfile(margin_m, np.full(len(HEIGHTS), 8.0), np.where(HEIGHTS < 0.9, 0.0, 8.0))
@@ -130,7 +133,8 @@ def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene:
         mock.patch("stages.body.fit_body_without_others", side_effect=fit_and_remember) as fit,
         mock.patch("stages.body.check_fit_quality", wraps=check_fit_quality) as check,
     ):
-        run({"frames": tmp_path / "frames"}, tmp_path / "body", Config(height_m=scene.model.height_m()[0], rounds=1))
+        config = Config(height_m=scene.model.height_m()[0], rounds=1, supplied_poses="ignore")
+        run({"frames": tmp_path / "frames"}, tmp_path / "body", config)
     assert [call.args[3].hem for call in fit.call_args_list] == [None, skirt.hem_height()]
     check.assert_called_once()  # below a skirt the body does not fill the mask
     scores = load_scores(tmp_path / "body" / "scores.npz")

@@ -173,6 +173,7 @@ def fit_supplied_poses(
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
     result = _result(context, model, state, observations, silhouette_iou, left_right_swapped)
+    result = replace(result, shape_is_supplied=True)
     return replace(result, rotations_wxyz=supplied.overwrite_all_rotations(result.rotations_wxyz)) if keep else result
 
 

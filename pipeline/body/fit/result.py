@@ -31,6 +31,7 @@ class FitResult:
     contradicting_focal_log: logarithm of the focal length that a turn shows over the supplied one, if they contradict;
         0 if they do not, or none was supplied.
     lean_deg: angle between +Y and the mean axis of the trunk (mid-hips to neck); over a full turn 0 for upright people.
+    shape_is_supplied: the user knows the shape, and it was not fitted.
     """
 
     body: Body
@@ -45,6 +46,7 @@ class FitResult:
     height_std_m: float
     lean_deg: float
     contradicting_focal_log: float = 0.0
+    shape_is_supplied: bool = False
 
 
 def landmark_errors_px(
