@@ -113,7 +113,7 @@ def run(
     result = fit_capture(capture, hands, windows, config, settings, out)
     legs = leg_profile_of(result, capture, windows)
     hem, motion = legs.hem_height(), motion_of(result, capture)
-    hem_of_skirt = hem if legs.stands_off() and not result.shape_is_supplied else None
+    hem_of_skirt = legs.outline_hem() if legs.stands_off() and not result.shape_is_supplied else None
     # The first body fills a skirt: it tells what is no cloth, and how well the frames fit.
     poses = canonical_to_world(result.body, motion)
     blob_shares = residual_blob_shares(result.body, poses, result.camera, windows, hem_of_skirt)
@@ -346,7 +346,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=40,
+    version=41,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -85,11 +85,17 @@ class LegProfile:
             nan where no frame shows it.
         gap_px: pixels between the legs of the body, mean over frames.
         open_px: those of them that the masks do not cover.
+        half_width_m: half the width of the legs with their margins, median over frames; nan where no frame shows it.
+        slope: tangent of the angle at which the camera sees a horizontal plane at each height, median over frames.
+        thigh_m: distance from hips to knees along the legs: the unit of `HEIGHTS`.
     """
 
     margin_m: Float[np.ndarray, "k"]
     gap_px: Float[np.ndarray, "k"]
     open_px: Float[np.ndarray, "k"]
+    half_width_m: Float[np.ndarray, "k"]
+    slope: Float[np.ndarray, "k"]
+    thigh_m: float
 
     def cloth_hangs_between_legs(self) -> bool:
         """Return whether a skirt or coat goes from leg to leg.
@@ -113,23 +119,39 @@ class LegProfile:
             return False
         return bool(self.open_px[:hem].sum() <= MAX_OPEN_SHARE * self.gap_px[:hem].sum())
 
-    def hem_height(self) -> float | None:
-        """Return the height of the hem of a skirt or coat, in the unit of `HEIGHTS`; None without one.
+    def outline_hem(self) -> float | None:
+        """Return where a skirt or coat ends in the pictures, in the unit of `HEIGHTS`; None without one.
 
         There the margin falls to half, or the background begins to be seen between the legs. Cloth down to the floor
         ends at the lowest of the heights.
         """
-        if not self.cloth_hangs_between_legs():
+        return HIGHEST + HEIGHT_STEP * (self._rows_at_hem()[1] - 0.5) if self.cloth_hangs_between_legs() else None
+
+    def hem_height(self) -> float | None:
+        """Return the height of the hem of a skirt or coat, in the unit of `HEIGHTS`; None without one.
+
+        From another height a hem is seen as an ellipse, whose lower side is nearer or farther than the legs, and below
+        the hem in the pictures. It is taken for a circle.
+        """
+        outline_hem = self.outline_hem()
+        if outline_hem is None:
             return None
+        widest, below = self._rows_at_hem()
+        radius_m, fall_m = np.nan_to_num(self.half_width_m[widest]), 0.5 * self._step_m()[widest]
+        depth_m = np.sqrt(radius_m**2 - max(radius_m - fall_m, 0.0) ** 2) if fall_m > 0.0 else radius_m
+        drop_m = np.nan_to_num(self.slope[min(below, len(HEIGHTS) - 1)]) * depth_m
+        return outline_hem - float(drop_m) / self.thigh_m
+
+    def _rows_at_hem(self) -> tuple[int, int]:
+        """Return the lowest row of the cloth at the hem that has its full width, and the first row below the hem."""
         step_m = self._step_m()
         row = int(np.argmax(step_m))
         if step_m[row] >= MIN_STEP_M:
             below_m = np.append(np.nan_to_num(self.margin_m)[row:], 0.0)
-            below = row + int(np.argmax(below_m < below_m[0] - 0.5 * step_m[row]))
-        else:
-            is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px < MIN_OPEN_SHARE * self.gap_px)
-            below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(HEIGHTS)
-        return float(HIGHEST + HEIGHT_STEP * (below - 0.5))
+            return row, row + int(np.argmax(below_m < below_m[0] - 0.5 * step_m[row]))
+        is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px < MIN_OPEN_SHARE * self.gap_px)
+        below = int(np.flatnonzero(is_covered)[-1]) + 1 if is_covered.any() else len(HEIGHTS)
+        return below - 1, below
 
     def stands_off(self) -> bool:
         """Return whether there is a skirt that stands off the legs at its hem."""
@@ -167,28 +189,29 @@ def leg_profile(
     found = np.flatnonzero(frames & np.array([window is not None for window in windows]))
     chosen = found[evenly_spaced(len(found), JUDGED_FRAMES)]
     legs = np.stack([_leg_faces(body, side) for side in LEGS])
-    rows = np.full((3, len(chosen), len(HEIGHTS)), np.nan)
+    rows = np.full((5, len(chosen), len(HEIGHTS)), np.nan)
     for k, pose in enumerate(canonical_to_world(body, motion.select(chosen))):
         window = windows[chosen[k]]
         if window is not None:
             rows[:, k] = _profile_of_frame(body, legs, pose, camera, window)
     seen = np.isfinite(rows[0]).any(axis=0)
-    margin_m = np.full(len(HEIGHTS), np.nan)
-    margin_m[seen] = np.nanmedian(rows[0][:, seen], axis=0)
-    gap_px, open_px = np.nansum(rows[1:], axis=1) / max(1, len(chosen))
-    return LegProfile(margin_m, gap_px, open_px)
+    medians = np.full((3, len(HEIGHTS)), np.nan)
+    medians[:, seen] = np.nanmedian(rows[[0, 3, 4]][..., seen], axis=1)
+    gap_px, open_px = np.nansum(rows[1:3], axis=1) / max(1, len(chosen))
+    thigh_m = body.height_on_legs_m(0.0) - body.height_on_legs_m(1.0)
+    return LegProfile(medians[0], gap_px, open_px, medians[1], medians[2], thigh_m)
 
 
 def _profile_of_frame(
     body: Body, legs: Bool[np.ndarray, "2 f"], pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
-) -> Float[np.ndarray, "3 k"]:
-    """Return margin (m), pixels between the legs, and uncovered ones of these; nan where the legs are not seen."""
+) -> Float[np.ndarray, "5 k"]:
+    """Return the values of a frame, in the order of `LegProfile`; nan where the legs are not seen."""
     vertices = pose_vertices(body, pose)
     face_id = rasterise_in_window(vertices, torch.from_numpy(body.faces), camera, window).face_id
     is_body = face_id >= 0
     left, right = legs[:, np.maximum(face_id, 0)] & is_body
     metres_per_px = body.height_m() / window.person_px
-    profile = np.full((3, len(HEIGHTS)), np.nan)
+    profile, slope = np.full((5, len(HEIGHTS)), np.nan), _slopes(body, pose, camera)
     for k, row in enumerate(rows_on_legs(HEIGHTS, body, pose, camera, window)):
         if not (0 <= row < len(face_id) and left[row].any() and right[row].any()):
             continue
@@ -199,22 +222,35 @@ def _profile_of_frame(
         between = np.zeros(len(cloth), dtype=bool)
         between[columns[0].max() + 1 : columns[1].min()] = True
         between &= ~is_body[row]
-        profile[:, k] = 0.5 * outside_px * metres_per_px, between.sum(), (between & ~window.mask[row]).sum()
+        margin_m, half_width_m = (0.5 * metres_per_px * px for px in (outside_px, outside_px + end + 1 - start))
+        profile[:, k] = margin_m, between.sum(), (between & ~window.mask[row]).sum(), half_width_m, slope[k]
     return profile
+
+
+def _slopes(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera) -> Float[np.ndarray, "k"]:
+    """Return the tangents of the angles at which the camera sees the planes across the legs at `HEIGHTS`."""
+    hip_m, knee_m = (_joints_m(body, pose, [side[part] for side in LEGS]).numpy().mean(axis=0) for part in (0, 1))
+    up = (hip_m - knee_m) / np.linalg.norm(hip_m - knee_m)
+    to_camera_m = camera.centre_m() - (hip_m + HEIGHTS[:, None] * (knee_m - hip_m))
+    above_m = to_camera_m @ up
+    return np.abs(above_m) / np.linalg.norm(to_camera_m - above_m[:, None] * up, axis=1)
 
 
 def rows_on_legs(
     heights: Iterable[float], body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
 ) -> list[int]:
     """Return the rows of a window at heights as of `Body.height_on_legs_m`, the mean of both legs."""
-    names = [side[k] for k in (0, 1) for side in LEGS]
-    places = [
-        pose[joint] @ torch.from_numpy(np.append(body.joints_m[joint], 1.0)).to(pose)
-        for joint in map(body.joint, names)
-    ]
-    px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
+    places_m = _joints_m(body, pose, [side[part] for part in (0, 1) for side in LEGS])
+    px = (project(places_m, camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
     hip_px, knee_px = px[:2].mean(), px[2:].mean()
     return [int(hip_px + height * (knee_px - hip_px)) for height in heights]
+
+
+def _joints_m(body: Body, pose: Float[Tensor, "j 4 4"], names: Sequence[str]) -> Float[Tensor, "k 3"]:
+    """Return the positions of joints in a pose, m, world."""
+    joints = list(map(body.joint, names))
+    rest_m = torch.from_numpy(np.pad(body.joints_m[joints], ((0, 0), (0, 1)), constant_values=1.0)).to(pose)
+    return torch.einsum("kab,kb->ka", pose[joints], rest_m)[:, :3]
 
 
 def _run_length(flags: Bool[np.ndarray, "n"]) -> int:

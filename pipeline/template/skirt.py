@@ -86,7 +86,7 @@ def find_hem(mesh: Mesh, skin_weights: Float[np.ndarray, "v j"], body: Body) -> 
     on_arms = _on_arms(skin_weights, body)
     garment = remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[~on_arms[mesh.faces].any(axis=1)]))
     hem_m = _lowest_full_section_m(garment, body.hem_m)
-    if hem_step(garment, body, hem_m) < MIN_HEM_STEP:
+    if hem_m is None or hem_step(garment, body, hem_m) < MIN_HEM_STEP:
         return None
     return Hem(hem_m, body.height_on_legs_m(0.0), garment)
 
@@ -179,11 +179,15 @@ def _largest_hull_m2(mesh: Mesh, hem_m: float) -> float:
     return max(_hull_area_m2(mesh, height_m) for height_m in np.arange(hem_m, hem_m + HEM_STEP_M, SLICE_M))
 
 
-def _lowest_full_section_m(mesh: Mesh, told_m: float) -> float:
-    """Return the lowest height near a told one at which the convex hull is larger than half way from legs to skirt."""
+def _lowest_full_section_m(mesh: Mesh, told_m: float) -> float | None:
+    """Return the lowest height near a told one at which the convex hull is larger than half way from legs to skirt.
+
+    None if it is at no height.
+    """
     heights_m = np.arange(told_m - HEM_RANGE_M, told_m + HEM_RANGE_M, SLICE_M)
     areas_m2 = np.array([_hull_area_m2(mesh, height_m) for height_m in heights_m])
-    return float(heights_m[np.argmax(areas_m2 > 0.5 * (areas_m2.min() + _largest_hull_m2(mesh, told_m)))])
+    is_full = areas_m2 > 0.5 * (areas_m2.min() + _largest_hull_m2(mesh, told_m))
+    return float(heights_m[np.argmax(is_full)]) if is_full.any() else None
 
 
 def _hull_area_m2(mesh: Mesh, height_m: float) -> float:

@@ -35,8 +35,32 @@ def motion_of(body: Body, bends: dict[str, tuple[float, float, float]], frames: 
 
 
 def silhouette(body: Body) -> np.ndarray:
-    vertices_px, depth_m = project(torch.as_tensor(body.vertices), CAMERA)
-    return rasterize(vertices_px, depth_m, torch.as_tensor(body.faces), SIDE_PX, SIDE_PX)[0].numpy() >= 0
+    return mask_of(body.vertices, body.faces, CAMERA)
+
+
+def mask_of(vertices_m: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    vertices_px, depth_m = project(torch.as_tensor(vertices_m, dtype=torch.float32), camera)
+    return rasterize(vertices_px, depth_m, torch.as_tensor(faces, dtype=torch.int32), SIDE_PX, SIDE_PX)[0].numpy() >= 0
+
+
+def camera_at(height_m: float) -> Camera:
+    """A camera 3 m in front of the axis of the body that looks at its middle."""
+    pitch_rad = np.arctan2(height_m - 0.85, 3.0)
+    down, forward = np.sin(pitch_rad), np.cos(pitch_rad)
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3] = [[1.0, 0.0, 0.0], [0.0, -forward, down], [0.0, -down, -forward]]
+    pose[:3, 3] = -pose[:3, :3] @ [0.0, height_m, 3.0]
+    return Camera(600.0, 600.0, 200.0, 200.0, SIDE_PX, SIDE_PX, pose)
+
+
+def skirt_surface(body: Body, hem_m: float, radius_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a cone without ends, from the hips to a hem of a radius."""
+    angle_rad = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    ring = np.stack([np.cos(angle_rad), 0.0 * angle_rad, np.sin(angle_rad)], axis=1)
+    middle_m = body.joints_m[body.joint("LeftUpLeg")] * [0.0, 0.0, 1.0]
+    vertices_m = np.concatenate([0.17 * ring + [0.0, 0.95, 0.0], radius_m * ring + [0.0, hem_m, 0.0]]) + middle_m
+    k, after = np.arange(64), (np.arange(64) + 1) % 64
+    return vertices_m, np.concatenate([np.stack([k, after, k + 64], 1), np.stack([after, after + 64, k + 64], 1)])
 
 
 def row_px(height_m: float) -> int:
@@ -58,16 +82,16 @@ def dressed(body: Body, hem_m: float, margin_px: int, between: bool) -> np.ndarr
     return mask
 
 
-def profile_of(body: Body, mask: np.ndarray) -> LegProfile:
+def profile_of(body: Body, mask: np.ndarray, camera: Camera = CAMERA) -> LegProfile:
     windows = [crop_mask_window(np.where(mask, np.uint8(255), np.uint8(0)))] * FRAMES
     motion = motion_of(body, {})
     motion = motion.with_pose(motion.rotations_wxyz, np.tile(body.joints_m[:1], (FRAMES, 1)))
-    return leg_profile(body, motion, CAMERA, windows, np.ones(FRAMES, dtype=bool))
+    return leg_profile(body, motion, camera, windows, np.ones(FRAMES, dtype=bool))
 
 
-def hem_of(profile: LegProfile, body: Body) -> float:
-    """Height of the hem, m; nan without one."""
-    height = profile.hem_height()
+def outline_hem_m(profile: LegProfile, body: Body) -> float:
+    """Height at which cloth ends in the pictures, m; nan without a hem."""
+    height = profile.outline_hem()
     return float("nan") if height is None else body.height_on_legs_m(height)
 
 
@@ -81,11 +105,21 @@ def test_bare_legs_and_trousers_hang_apart(body: Body) -> None:
 
 def test_a_skirt_ends_at_its_hem(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.6, 12, True))
-    assert hem_of(profile, body) == pytest.approx(0.6, abs=0.01)
+    assert outline_hem_m(profile, body) == pytest.approx(0.6, abs=0.01)
     knee_m, hip_m = (body.joints_m[body.joint(name), 1] for name in ("LeftLeg", "LeftUpLeg"))
     hem = (hip_m - 0.6) / (hip_m - knee_m)
     above = (HEIGHTS > 0.35) & (hem - 0.1 > HEIGHTS)
     assert np.nanmin(profile.margin_m[above]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("radius_m", "camera_m"), [(0.4, 2.0), (0.4, 0.5), (0.3, 1.6), (0.25, 1.3)])
+def test_the_near_side_of_a_hem_is_not_taken_for_its_height(body: Body, radius_m: float, camera_m: float) -> None:
+    """Seen from above the outline ends up to 12 cm below the hem."""
+    camera = camera_at(camera_m)
+    mask = mask_of(body.vertices, body.faces, camera) | mask_of(*skirt_surface(body, 0.5, radius_m), camera)
+    profile = profile_of(body, mask, camera)
+    assert body.height_on_legs_m(profile.hem_height() or np.nan) == pytest.approx(0.5, abs=0.025)
+    assert camera_m < 1.0 or outline_hem_m(profile, body) < 0.5 - 0.015
 
 
 def test_a_skirt_with_a_wide_hem_stands_off(body: Body) -> None:
@@ -99,18 +133,18 @@ def test_a_close_skirt_covers_the_gap(body: Body) -> None:
     """Its hem is no step: the fitted hips are as wide as the skirt."""
     profile = profile_of(body, dressed(body, 0.6, 2, True))
     assert np.nanmax(profile.margin_m) < 0.02
-    assert hem_of(profile, body) == pytest.approx(0.6, abs=0.01)
+    assert outline_hem_m(profile, body) == pytest.approx(0.6, abs=0.01)
 
 
 @pytest.mark.parametrize("hem_m", [0.45, 0.3, 0.2])
 def test_long_skirts_end_at_their_hems(body: Body, hem_m: float) -> None:
     """The last is below all heights that tell a skirt."""
-    assert hem_of(profile_of(body, dressed(body, hem_m, 14, True)), body) == pytest.approx(hem_m, abs=0.015)
+    assert outline_hem_m(profile_of(body, dressed(body, hem_m, 14, True)), body) == pytest.approx(hem_m, abs=0.015)
 
 
 def test_cloth_down_to_the_floor_ends_at_the_lowest_height(body: Body) -> None:
     profile = profile_of(body, dressed(body, 0.05, 14, True))
-    assert hem_of(profile, body) == pytest.approx(body.height_on_legs_m(float(HEIGHTS[-1])), abs=0.01)
+    assert outline_hem_m(profile, body) == pytest.approx(body.height_on_legs_m(float(HEIGHTS[-1])), abs=0.01)
 
 
 def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:
@@ -125,10 +159,14 @@ def test_trousers_that_touch_each_other_down_to_the_floor_are_no_skirt() -> None
     """Shins stand 3 cm from each other. Where the background is seen below, or they stand farther apart, it is one."""
     margin_m, rows = np.full(len(HEIGHTS), 0.004), HEIGHTS
     narrow_px, covered = np.interp(rows, (0.7, 1.2), (0.0, 4.5)), np.zeros(len(rows))
-    assert not LegProfile(margin_m, narrow_px, covered).cloth_hangs_between_legs()
-    assert LegProfile(margin_m, 2.0 * narrow_px, covered).cloth_hangs_between_legs()
-    assert LegProfile(margin_m, narrow_px, np.where(rows >= 1.4, narrow_px, 0.0)).cloth_hangs_between_legs()
-    assert not LegProfile(margin_m, narrow_px, np.where(rows <= 1.0, narrow_px, 0.0)).cloth_hangs_between_legs()
+
+    def is_skirt(gap_px: np.ndarray, open_px: np.ndarray) -> bool:
+        return LegProfile(margin_m, gap_px, open_px, 0.1 + margin_m, 0.0 * rows, 0.4).cloth_hangs_between_legs()
+
+    assert not is_skirt(narrow_px, covered)
+    assert is_skirt(2.0 * narrow_px, covered)
+    assert is_skirt(narrow_px, np.where(rows >= 1.4, narrow_px, 0.0))
+    assert not is_skirt(narrow_px, np.where(rows <= 1.0, narrow_px, 0.0))
 
 
 def test_frames_without_masks_tell_nothing(body: Body) -> None:

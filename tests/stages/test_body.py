@@ -121,7 +121,8 @@ def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene:
     save_smpl_poses(tmp_path / "frames" / "smpl_poses.npz", make_poses(FRAMES))
     (tmp_path / "body").mkdir()
     margin_m = np.where(HEIGHTS < 0.9, 0.12, 0.0)
-    skirt = LegProfile(margin_m, np.full(len(HEIGHTS), 8.0), np.where(HEIGHTS < 0.9, 0.0, 8.0))
+    rows, open_px = np.ones(len(HEIGHTS)), np.where(HEIGHTS < 0.9, 0.0, 8.0)
+    skirt = LegProfile(margin_m, 8.0 * rows, open_px, margin_m + 0.15, 0.2 * rows, 0.4)
     fits = []
 
     def fit_and_remember(*args) -> FitResult:
@@ -135,7 +136,7 @@ def test_below_a_skirt_that_stands_off_the_body_is_fitted_again(tmp_path, scene:
     ):
         config = Config(height_m=scene.model.height_m()[0], rounds=1, supplied_poses="ignore")
         run({"frames": tmp_path / "frames"}, tmp_path / "body", config)
-    assert [call.args[3].hem for call in fit.call_args_list] == [None, skirt.hem_height()]
+    assert [call.args[3].hem for call in fit.call_args_list] == [None, skirt.outline_hem()]
     check.assert_called_once()  # below a skirt the body does not fill the mask
     scores = load_scores(tmp_path / "body" / "scores.npz")
     np.testing.assert_array_equal(scores.silhouette_iou, fits[0].silhouette_iou)
