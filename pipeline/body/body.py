@@ -115,6 +115,12 @@ def canonical_to_world(body: Body, motion: Motion) -> Float[Tensor, "n j 4 4"]:
     return skinning_transforms(joint_to_world, joints_m)
 
 
+def posed_joints_m(body: Body, canonical_to_world: Float[Tensor, "*n j 4 4"]) -> Float[np.ndarray, "*n j 3"]:
+    """Return the positions of all joints, m, world; float64."""
+    transforms = canonical_to_world.numpy().astype(np.float64)
+    return (transforms[..., :3, :3] @ body.joints_m[:, :, None])[..., 0] + transforms[..., :3, 3]
+
+
 PHENOTYPE_DEFAULTS = {
     "gender": 0.5,
     "age": 2.0 / 3.0,

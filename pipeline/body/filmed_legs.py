@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.body import Body, Motion, canonical_to_world, posed_joints_m
 from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
@@ -87,7 +87,7 @@ class LegProfile:
         open_px: those of them that the masks do not cover.
         half_width_m: half the width of the legs with their margins, median over frames; nan where no frame shows it.
         slope: tangent of the angle at which the camera sees a horizontal plane at each height, median over frames.
-        thigh_m: distance from hips to knees along the legs: the unit of `HEIGHTS`.
+        thigh_m: height of the hips above the knees in the A-pose: the unit of `HEIGHTS`.
     """
 
     margin_m: Float[np.ndarray, "k"]
@@ -130,8 +130,8 @@ class LegProfile:
     def hem_height(self) -> float | None:
         """Return the height of the hem of a skirt or coat, in the unit of `HEIGHTS`; None without one.
 
-        From another height a hem is seen as an ellipse, whose lower side is nearer or farther than the legs, and below
-        the hem in the pictures. It is taken for a circle.
+        The hem is taken for a circle around the legs. Seen from above or below it is an ellipse, whose lower half is
+        below the hem in the pictures: `outline_hem` is too low.
         """
         outline_hem = self.outline_hem()
         if outline_hem is None:
@@ -143,7 +143,7 @@ class LegProfile:
         return outline_hem - float(drop_m) / self.thigh_m
 
     def _rows_at_hem(self) -> tuple[int, int]:
-        """Return the lowest row of the cloth at the hem that has its full width, and the first row below the hem."""
+        """Return the row of the cloth above the hem whose width counts, and the first row below the hem."""
         step_m = self._step_m()
         row = int(np.argmax(step_m))
         if step_m[row] >= MIN_STEP_M:
@@ -229,7 +229,7 @@ def _profile_of_frame(
 
 def _slopes(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera) -> Float[np.ndarray, "k"]:
     """Return the tangents of the angles at which the camera sees the planes across the legs at `HEIGHTS`."""
-    hip_m, knee_m = (_joints_m(body, pose, [side[part] for side in LEGS]).numpy().mean(axis=0) for part in (0, 1))
+    hip_m, knee_m = _hips_and_knees_m(body, pose).mean(axis=1)
     up = (hip_m - knee_m) / np.linalg.norm(hip_m - knee_m)
     to_camera_m = camera.centre_m() - (hip_m + HEIGHTS[:, None] * (knee_m - hip_m))
     above_m = to_camera_m @ up
@@ -240,17 +240,14 @@ def rows_on_legs(
     heights: Iterable[float], body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
 ) -> list[int]:
     """Return the rows of a window at heights as of `Body.height_on_legs_m`, the mean of both legs."""
-    places_m = _joints_m(body, pose, [side[part] for part in (0, 1) for side in LEGS])
-    px = (project(places_m, camera)[0][:, 1].numpy() - window.top_px) * window.scale_xy[1]
-    hip_px, knee_px = px[:2].mean(), px[2:].mean()
+    places_px, _ = project(torch.from_numpy(_hips_and_knees_m(body, pose)), camera)
+    hip_px, knee_px = ((places_px[..., 1].numpy() - window.top_px) * window.scale_xy[1]).mean(axis=1)
     return [int(hip_px + height * (knee_px - hip_px)) for height in heights]
 
 
-def _joints_m(body: Body, pose: Float[Tensor, "j 4 4"], names: Sequence[str]) -> Float[Tensor, "k 3"]:
-    """Return the positions of joints in a pose, m, world."""
-    joints = list(map(body.joint, names))
-    rest_m = torch.from_numpy(np.pad(body.joints_m[joints], ((0, 0), (0, 1)), constant_values=1.0)).to(pose)
-    return torch.einsum("kab,kb->ka", pose[joints], rest_m)[:, :3]
+def _hips_and_knees_m(body: Body, pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "2 2 3"]:
+    """Return the positions of both hip joints and of both knees in a pose, m, world."""
+    return posed_joints_m(body, pose)[[[body.joint(side[part]) for side in LEGS] for part in (0, 1)]]
 
 
 def _run_length(flags: Bool[np.ndarray, "n"]) -> int:

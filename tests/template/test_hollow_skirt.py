@@ -22,6 +22,7 @@ from pipeline.geometry.surface import (
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin_weights
 from pipeline.template.hollow_skirt import THICKNESS_M, cut_out, find_cavity, find_lining, hollow_skin, vertices_inside
 from pipeline.template.regions import outer_surface
+from pipeline.template.skirt import find_hem
 
 SPACING_M, EDGE_M = 0.012, 0.012
 HEM_M, WAIST_M = 0.62, 1.0
@@ -35,11 +36,12 @@ def radius_m(height_m: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=3)
 def filmed(
-    trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M, inner_m: float = 0.0
+    trousers_m: float = 0.0, has_skirt: bool = True, hem_m: float = HEM_M, inner_m: float = 0.0, stump_m: float = 0.0
 ) -> tuple[Mesh, Body]:
     """What frames show of a person: a skirt that is solid down to its hem, and legs in trousers of a thickness.
 
-    inner_m: by how much these are thicker between the legs.
+    inner_m: by how much these are thicker between the legs. stump_m: height of what hangs below the hem, two thirds as
+    wide.
     """
     model = load_anny()
     body = replace(model.at_shape(model.shape_defaults), hem_m=hem_m if has_skirt else None)
@@ -54,6 +56,8 @@ def filmed(
     if has_skirt:
         cone_m = np.hypot(x, z - hips_z_m(body)) - radius_m(y)
         distance_m = np.minimum(distance_m, np.maximum(cone_m, np.maximum(hem_m - y, y - WAIST_M)))
+        stump = np.maximum(cone_m + 0.35 * HEM_RADIUS_M, np.maximum(hem_m - stump_m - y, y - hem_m))
+        distance_m = np.minimum(distance_m, stump) if stump_m else distance_m
     return largest_component(isosurface(-distance_m, 0.0, low, SPACING_M)), body
 
 
@@ -89,6 +93,14 @@ def test_a_skirt_is_hollow_and_open_at_its_hem() -> None:
     )
     assert is_inside(points, solid).all()
     assert not is_inside(points, found).any()
+
+
+def test_a_hem_that_is_not_where_it_is_told_is_none() -> None:
+    """It is 6 cm higher. Taken for the place where the search starts, a membrane would close the skirt."""
+    solid, body = filmed(stump_m=0.08)
+    weights = transfer_skin_weights(solid, body)
+    assert find_hem(solid, weights, body) is not None
+    assert find_hem(solid, weights, replace(body, hem_m=HEM_M - 0.06)) is None
 
 
 def test_cloth_has_a_thickness_and_its_outside_stays() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.body import Body, Motion, canonical_to_world, posed_joints_m
 from pipeline.body.fit.ground_contact import SOLE_JOINTS, compute_speed_m_s
 from pipeline.capture.frame_selection import runs_of
 
@@ -20,8 +20,7 @@ MIN_CONTACT_S = 0.1
 
 def joint_positions_m(body: Body, motion: Motion) -> Float[np.ndarray, "n j 3"]:
     """Return the world positions of all joints."""
-    transforms = canonical_to_world(body, motion).numpy().astype(np.float64)
-    return (transforms[..., :3, :3] @ body.joints_m[:, :, None])[..., 0] + transforms[..., :3, 3]
+    return posed_joints_m(body, canonical_to_world(body, motion))
 
 
 def sole_positions_m(body: Body, motion: Motion) -> Float[np.ndarray, "n 4 3"]:
