@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> None:
     require_absent(options.out)
     subject = read_rigged_person(options.person)
     scene = build_scene(options, subject.body)
-    motion = build_motion(options, subject.body, scene[1])
+    motion = build_motion(options, subject.body, scene)
     capture, heldout = build_capture(options, subject, motion, scene)
     settings = {"source": "gltf", **settings_from_options(options), "person": options.person.name}
     write_capture(options.out, capture, None, heldout, settings)

@@ -22,6 +22,9 @@ from data_tools.synthetic.scene.options import (
 )
 from pipeline.core.errors import UserError
 
+PHENOTYPES = ("age", "weight")
+"""Of the person's shape; a child has an age of 1/3, an adult one of 2/3."""
+
 
 def main(argv: Sequence[str]) -> None:
     """Render one capture."""
@@ -36,6 +39,8 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--sleeve-flare-m", type=float, default=0.0, help="widening of the sleeves to the hem, metres")
     parser.add_argument("--finger-mm", type=float, help="width of the fingers, mm; that of the person if absent")
+    for name in PHENOTYPES:
+        parser.add_argument(f"--{name}", type=float, help=f"Anny's {name}, 0 to 1; that of the seed if absent")
     options = parser.parse_args(argv)
     validate_capture_options(options)
     if options.flare_m is not None and options.legwear != "skirt":
@@ -43,11 +48,12 @@ def main(argv: Sequence[str]) -> None:
     require_absent(options.out)
     flare_m = HEM_FLARE_M if options.flare_m is None else options.flare_m
     finger_m = None if options.finger_mm is None else 1e-3 * options.finger_mm
+    phenotypes = {name: vars(options)[name] for name in PHENOTYPES if vars(options)[name] is not None}
     subject, bare = make_person(
-        options.seed, options.texture, options.legwear, flare_m, options.sleeve_flare_m, finger_m
+        options.seed, options.texture, options.legwear, flare_m, options.sleeve_flare_m, finger_m, phenotypes
     )
     scene = build_scene(options, subject.body)
-    motion = build_motion(options, subject.body, scene[1])
+    motion = build_motion(options, subject.body, scene)
     capture, heldout = build_capture(options, subject, motion, scene)
     write_capture(options.out, capture, bare, heldout, {"source": "sample", **settings_from_options(options)})
     print(f"{options.out}/video/video.mp4 and its ground truth in {options.out}/truth")

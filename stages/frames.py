@@ -23,6 +23,7 @@ from pipeline.capture.input_checks import (
     assess_input,
     check_frames_that_differ,
     check_input,
+    is_cut_off,
     sample_scene_changes,
 )
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
@@ -87,6 +88,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
                 source, user_files, frame_indices, _PEOPLE_COUNT_FRAMES, config.max_side_px, workers
             )
             save_detections(out / CHECKPOINT, detections)
+        if user_files.split is None:
+            detections = leave_out_cut_off(detections, source.path, config.min_frames)
         check_input(detections, source.path, config.min_frames)
         detections, moved_px = stabilise_camera(detections, source, user_files)
         noise = comparison_noise(detections)
@@ -119,6 +122,22 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "turns": selected.turns,
         "scale": detections.scale,
     }
+
+
+def leave_out_cut_off(detections: Detections, path: Path, min_frames: int) -> Detections:
+    """Return the detections without frames that cut off the person, as far as others show the same side.
+
+    A person who films alone comes from the camera and goes back to it.
+    """
+    is_poor = is_cut_off(detections)
+    unneeded = selection.find_replaceable(selection.body_yaw_rad(detections.landmarks_world_m), is_poor)
+    if not unneeded.any() or (detections.found & ~unneeded).sum() < min_frames:
+        return detections
+    warn(
+        f"{unneeded.sum()} frames of {path} that cut off the person are left out, others show the same side: "
+        f"{selection.format_frame_ranges(detections.frame_index, unneeded)}"
+    )
+    return detections.rows(~unneeded)
 
 
 def stabilise_camera(detections: Detections, source: FrameSource, user_files: UserFiles) -> tuple[Detections, float]:
@@ -288,7 +307,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=18,
+    version=19,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

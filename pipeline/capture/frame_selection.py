@@ -20,6 +20,8 @@ SPLIT_PERIOD = 8
 VALIDATION_PHASE = 4
 MIN_SHARE, MAX_SHARE = 0.5, 1.8
 """Held-out and validation frames over an eighth of all frames: beyond these limits frames are missing in step."""
+SAME_SIDE_RAD, MIN_REPLACEMENTS = np.radians(15.0), 3
+"""A poor frame is left out if so many others show the person from the same side, which is within this angle."""
 # Mean absolute difference of two images of the same scene when rounding to integer levels is the only noise:
 # E|round(a + e1) - round(a + e2)| with independent uniform dither = 1/3.
 _QUANTISATION_NOISE = 1.0 / 3.0
@@ -140,6 +142,15 @@ def body_yaw_rad(landmarks_world_m: Float[np.ndarray, "n 33 3"]) -> Float[np.nda
     left_shoulder, right_shoulder, left_hip, right_hip = (landmarks_world_m[:, index] for index in TORSO)
     leftward = left_shoulder - right_shoulder + left_hip - right_hip
     return np.arctan2(leftward[:, 2], leftward[:, 0])
+
+
+def find_replaceable(yaw_rad: Float[np.ndarray, "n"], is_poor: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Return the poor frames that are not needed: others show the person from the same side.
+
+    yaw_rad: of the torso, from `body_yaw_rad`; nan where unknown.
+    """
+    apart_rad = np.abs(np.angle(np.exp(1j * (yaw_rad[:, None] - yaw_rad[None, ~is_poor]))))
+    return is_poor & ((apart_rad <= SAME_SIDE_RAD).sum(axis=1) >= MIN_REPLACEMENTS)
 
 
 def largest_yaw_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:

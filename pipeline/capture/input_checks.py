@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.capture.detection import Detections
 from pipeline.capture.frame_selection import evenly_spaced, format_frame_ranges
-from pipeline.capture.landmarks import ANKLES, FEET, TORSO
+from pipeline.capture.landmarks import ANKLES, FEET, TORSO, PoseLandmark
 from pipeline.capture.masks.background_plate import detect_scene_changes
 from pipeline.capture.person_detector import is_ankle_visible
 from pipeline.core.errors import UserError
@@ -17,6 +17,8 @@ from pipeline.core.progress import warn
 _MAX_BLACK_LEVEL = 8
 # Height of a shoe's sole below the landmarks of heel and toe, as a fraction of the image height.
 _SOLE_HEIGHT_FRACTION = 0.02
+# Half the width of a head, as a fraction of the image width.
+_HEAD_HALF_WIDTH_FRACTION = 0.03
 # Minimum cosine between the spine (shoulders to hips) and the image's downward axis of a standing person.
 _MIN_UPRIGHT_COSINE = 0.5
 _MAX_UNSEEN_ARC_DEG = 120.0
@@ -87,6 +89,24 @@ def check_input(detections: Detections, path: Path, min_frames: int) -> None:
         )
 
 
+def are_feet_cut_off(detections: Detections) -> Bool[np.ndarray, "n"]:
+    """Return whether a foot is below the picture, as far as landmarks tell."""
+    lowest_px = np.fmax.reduce(detections.landmarks_px[:, FEET, 1], axis=1)
+    return lowest_px > (1.0 - _SOLE_HEIGHT_FRACTION) * detections.height
+
+
+def is_cut_off(detections: Detections) -> Bool[np.ndarray, "n"]:
+    """Return whether head or feet are beyond the picture: the mask reaches its top over the nose, or the feet are cut.
+
+    Hands at its sides do not count.
+    """
+    masks = detections.person_masks
+    column_px = (np.arange(masks.shape[2]) + 0.5) * detections.width / masks.shape[2]
+    nose_px = detections.landmarks_px[:, PoseLandmark.NOSE]
+    over_nose = np.abs(column_px - nose_px[:, :1]) <= _HEAD_HALF_WIDTH_FRACTION * detections.width
+    return (masks[:, 0] & over_nose).any(axis=1) | (nose_px[:, 1] < 0.0) | are_feet_cut_off(detections)
+
+
 def _is_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
     """Return whether the spine is upright in at least half of the frames; shoulders come before hips."""
     spine_px = torso_px[:, 2:].mean(axis=1) - torso_px[:, :2].mean(axis=1)
@@ -108,8 +128,7 @@ def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> d
             f"{missing.sum()} of {len(missing)} frames of {path} show no person and are dropped: "
             f"{format_frame_ranges(detections.frame_index, missing)}"
         )
-    lowest_px = np.fmax.reduce(detections.landmarks_px[:, FEET, 1], axis=1)
-    cropped = detections.found & (lowest_px > (1.0 - _SOLE_HEIGHT_FRACTION) * detections.height)
+    cropped = detections.found & are_feet_cut_off(detections)
     if cropped.any():
         warn(
             f"the feet are cut off in {cropped.sum()} frames of {path}; the avatar's feet will be less sharp: "

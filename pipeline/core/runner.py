@@ -5,6 +5,7 @@ Linux the command forks itself, so that libraries are imported once and not by e
 where the calling process may have threads that a fork would break, each stage starts an interpreter.
 """
 
+import faulthandler
 import multiprocessing
 import os
 import subprocess
@@ -26,6 +27,7 @@ from pipeline.core.run_folder import RunRequest, StageFailedError, StageKilledEr
 from pipeline.core.stage import StagePlan, discard_work_dir, plan_stage, run_stage
 
 EXIT_INTERRUPTED = 130
+_STDERR_DESCRIPTOR = 2
 HOW_TO_RESUME = {
     False: "run the same command again to resume",
     True: "the same command starts over, because of --force or --from; without it, earlier results stay as they are",
@@ -156,7 +158,7 @@ class _StageRunner:
         if sys.platform == "linux" and self.options.fork_command and self.options.progress is None:
             self._check_exit_status(_run_in_fork(self.options.fork_command, arguments, environment), "")
             return
-        command = [sys.executable, "-P", "-m", self.pipeline.package, *arguments]
+        command = [sys.executable, "-P", "-X", "faulthandler", "-m", self.pipeline.package, *arguments]
         environment |= import_path_environment()
         has_events = self.options.progress is not None
         if has_events:
@@ -212,6 +214,7 @@ def _run_in_fork(command: StageCommand, arguments: list[str], environment: Mappi
 
     def run_command() -> None:
         os.environ.update(environment)
+        faulthandler.enable(file=_STDERR_DESCRIPTOR)  # a crash of a library tells the line that called it
         sys.exit(command(arguments))
 
     child = multiprocessing.get_context("fork").Process(target=run_command)

@@ -118,6 +118,18 @@ def test_yaw_of_a_turned_torso(yaw_deg):
     assert np.cos(difference) == pytest.approx(1, abs=1e-6)
 
 
+def test_poor_frames_are_not_needed_where_others_show_the_same_side():
+    """A turn in steps of 5 degrees whose first quarter is poor: only its ends have three good neighbours."""
+    yaw_rad = np.radians(np.arange(0.0, 360.0, 5.0))
+    is_poor = yaw_rad < np.radians(89.0)
+    np.testing.assert_array_equal(np.flatnonzero(selection.find_replaceable(yaw_rad, is_poor)), [0, 17])
+    again = np.concatenate([yaw_rad, yaw_rad + 2.0 * np.pi])  # a second turn, all good
+    poor_once = np.concatenate([is_poor, np.zeros(72, bool)])
+    np.testing.assert_array_equal(selection.find_replaceable(again, poor_once), poor_once)
+    unknown = np.where(is_poor, np.nan, yaw_rad)
+    assert not selection.find_replaceable(unknown, is_poor).any()
+
+
 def test_widest_unseen_arc():
     assert selection.largest_yaw_gap_rad(np.radians([0.0, 90, 200, 350])) == pytest.approx(np.radians(150))
     assert selection.largest_yaw_gap_rad(np.array([1.0])) == pytest.approx(2 * np.pi)

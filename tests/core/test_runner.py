@@ -1,8 +1,10 @@
 """Running a pipeline from Python: progress, errors and cancellation, with stages in child processes and in this one."""
 
 import os
+import re
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -112,6 +114,17 @@ def test_a_fork_that_fails_names_its_stage(
 ) -> None:
     with pytest.raises(error, match=message):
         run_pipeline(PIPELINE, RunRequest(toy.run_dir, toy.video), RunOptions(fork_command=command))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks")
+def test_a_fork_that_crashes_prints_where(toy: Toy, capfd: pytest.CaptureFixture[str]) -> None:
+    def crash(_: Sequence[str]) -> int:
+        os.kill(os.getpid(), signal.SIGSEGV)
+        return 0
+
+    with pytest.raises(UserError, match="stage read was killed by signal 11"):
+        run_pipeline(PIPELINE, RunRequest(toy.run_dir, toy.video), RunOptions(fork_command=crash))
+    assert re.search(r"Segmentation fault[\s\S]*test_runner.py\", line \d+ in crash", capfd.readouterr().err)
 
 
 def test_events_are_lines_of_their_own(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """The frames stage from folder to artifact: on drawn recordings with masks beside them, and on the real ones."""
 
 import json
+import re
 from unittest import mock
 
 import cv2
@@ -264,6 +265,31 @@ def test_a_frame_with_a_mask_and_without_landmarks_is_kept(tmp_path):
     assert np.isnan(capture.landmarks_px[7]).all()
     assert np.isnan(capture.landmarks_visibility[7]).all()
     assert np.isfinite(np.delete(capture.landmarks_px, 7, axis=0)).all()
+
+
+def cut_off_feet(folder, count):
+    """Put the ankles and a toe of the first frames below the picture, whose height is 96."""
+    arrays = load_npz(folder / "landmarks.npz")
+    arrays["landmarks_px"][:count, [27, 28, 31], 1] = 97.0
+    save_npz(folder / "landmarks.npz", arrays)
+
+
+def test_frames_that_cut_off_the_person_are_left_out_where_others_show_the_same_side(tmp_path):
+    """A turn in steps of 4.5 degrees whose first four frames have no feet; they stay if all frames are needed."""
+    folder = draw_recording(tmp_path / "in", n=80)
+    cut_off_feet(folder, 4)
+    run(folder, tmp_path / "out")
+    assert load_capture(tmp_path / "out").frame_index[0] == 4
+    assert re.search(r"4 frames of .* that cut off the person are left out, .*: 0-3$", take_warnings()[0])
+    assert run(folder, tmp_path / "all", min_frames=80)["frames"] == 80
+
+
+def test_a_recording_that_mostly_cuts_off_the_person_is_used_if_a_turn_does_not(tmp_path):
+    """Two turns in 88 frames, without feet in the first and in six of the second: these sides stay in the first."""
+    folder = draw_recording(tmp_path / "in", n=88, turns=2)
+    cut_off_feet(folder, 50)
+    run(folder, tmp_path / "out")
+    np.testing.assert_array_equal(load_capture(tmp_path / "out").frame_index, [*range(7), *range(43, 88)])
 
 
 def test_the_same_recording_gives_the_same_bytes(tmp_path):

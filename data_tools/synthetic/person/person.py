@@ -1,5 +1,6 @@
 """Generate the built-in clothed person from the parametric body model Anny; no download is needed."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -36,18 +37,19 @@ def make_person(
     hem_flare_m: float = HEM_FLARE_M,
     sleeve_flare_m: float = 0.0,
     finger_width_m: float | None = None,
+    phenotypes: Mapping[str, float] | None = None,
 ) -> tuple[Subject, Body]:
     """Return the clothed, textured person of a seed, and the body without clothes.
 
     Equal seeds give equal arrays, whatever the number of threads.
 
     texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m: see `Outfit`. finger_width_m: None: that of
-    the person.
+    the person. phenotypes: of Anny, each in [0, 1]; others are those of the seed.
     """
     model, noise = load_anny(), ValueNoise(seed)
     outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m)
     with torch_threads(1):
-        bare = model.at_shape(_shape(model, seed))
+        bare = model.at_shape(_shape(model, seed, phenotypes or {}))
     if finger_width_m is not None:
         bare = with_finger_width(bare, finger_width_m)
     anatomy = measure_anatomy(model, bare)
@@ -57,11 +59,13 @@ def make_person(
     return Subject(clothed.body, clothed.uv, clothed.faces_uv, texture, labels), bare
 
 
-def _shape(model: AnnyBody, seed: int) -> Float[Tensor, "p"]:
+def _shape(model: AnnyBody, seed: int, phenotypes: Mapping[str, float]) -> Float[Tensor, "p"]:
     """Return the shape parameters of a seed; seed 0 has the mean phenotypes, others vary around them."""
     shape = model.shape_defaults.clone()
     random = np.random.default_rng([seed, 1])
     for name, (middle, spread) in _PHENOTYPES.items():
         offset = spread * random.uniform(-1.0, 1.0) if seed else 0.0
         shape[model.shape_names.index(name)] = float(np.clip(middle + offset, 0.0, 1.0))
+    for name, value in phenotypes.items():
+        shape[model.shape_names.index(name)] = value
     return shape

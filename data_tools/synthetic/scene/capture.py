@@ -156,20 +156,26 @@ def portrait_camera(
     return replace(camera, world_to_camera=(rolled @ pitched).astype(np.float32)), ground_m
 
 
-def novel_cameras(camera: Camera, person_position_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
+def distance_to_middle_m(camera: Camera, person_position_m: np.ndarray, height_m: float) -> float:
+    """Return the distance from a camera to the middle of a body; see `novel_cameras`."""
+    return float(np.linalg.norm(person_position_m + [0.0, 0.5 * height_m, 0.0] - camera.centre_m()))
+
+
+def novel_cameras(
+    camera: Camera, person_position_m: np.ndarray, height_m: float, count: int, distance_m: float
+) -> tuple[Camera, ...]:
     """Return orbit cameras around the person at azimuths and elevations that the capture does not contain.
 
-    Each camera looks at the middle of the body from the distance of the capture's camera; +Y is up in the image.
+    Each camera looks at the middle of the body; +Y is up in the image.
 
     Args:
         person_position_m: point on the ground where the person stands in the rendered pose (world).
     """
     middle = person_position_m + [0.0, 0.5 * height_m, 0.0]
-    distance = float(np.linalg.norm(middle - camera.centre_m()))
     azimuths_rad = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
     elevations_rad = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
     return tuple(
-        replace(camera, world_to_camera=_orbit_world_to_camera(middle, distance, azimuth_rad, elevation_rad))
+        replace(camera, world_to_camera=_orbit_world_to_camera(middle, distance_m, azimuth_rad, elevation_rad))
         for azimuth_rad, elevation_rad in zip(azimuths_rad, elevations_rad, strict=True)
     )
 

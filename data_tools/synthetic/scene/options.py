@@ -10,7 +10,15 @@ from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.backdrop import Room, make_room
 from data_tools.synthetic.scene.ball import Ball
-from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
+from data_tools.synthetic.scene.capture import (
+    HeldOutTargets,
+    SyntheticCapture,
+    distance_to_middle_m,
+    novel_cameras,
+    portrait_camera,
+)
+from data_tools.synthetic.scene.film_alone import MIN_FRAMES as FILM_ALONE_MIN_FRAMES
+from data_tools.synthetic.scene.film_alone import film_alone
 from data_tools.synthetic.scene.motion import add_joint_angles, bend_at_hips, novel_motion, posture, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from data_tools.synthetic.scene.walk_around import make_surroundings, walking_shift_m
@@ -58,6 +66,9 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--walk-around", action="store_true", help="the person stands still and the camera is carried around"
+    )
+    parser.add_argument(
+        "--film-alone", action="store_true", help="the person comes from the camera, turns, and goes back to it"
     )
     parser.add_argument(
         "--lean-deg",
@@ -127,6 +138,8 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("flare_m", 0.0, 0.6),
         ("sleeve_flare_m", 0.0, 0.15),
         ("finger_mm", 1.0, 30.0),
+        ("age", 0.0, 1.0),
+        ("weight", 0.0, 1.0),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
         ("texture", 64, 8192),
@@ -140,6 +153,10 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         raise UserError("--turns is for the full turn in A-pose; remove it, or --bvh and --arc")
     if options.walk_around and (options.bvh or options.arc < 360.0 or options.ball):
         raise UserError("--walk-around is for a person who stands still; remove it, or --bvh, --arc and --ball")
+    if options.film_alone and (options.bvh or options.arc < 360.0 or options.walk_around):
+        raise UserError("--film-alone is for a full turn on the spot; remove it, or --bvh, --arc and --walk-around")
+    if options.film_alone and options.frames < FILM_ALONE_MIN_FRAMES:
+        raise UserError(f"--film-alone needs --frames {FILM_ALONE_MIN_FRAMES} at least, not {options.frames}")
     if options.size % 2:
         raise UserError(f"--size {options.size} is odd; H.264 needs an even size: choose {options.size + 1}")
 
@@ -173,8 +190,9 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
     return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
 
 
-def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
+def build_motion(options: argparse.Namespace, body: Body, scene: tuple[Camera, np.ndarray, Room]) -> Motion:
     """Return the turn in A-pose, or the selected part of the --bvh file, in the posture of the options."""
+    camera, ground_m, _ = scene
     if options.bvh:
         full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
         motion = resample_motion(full_motion, options.start, options.frames, options.fps)
@@ -187,7 +205,9 @@ def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) 
     if options.lower_arms_deg or options.close_legs_deg or options.hand_on_hip:
         angles = posture(options.lower_arms_deg, options.close_legs_deg, options.hand_on_hip)
         motion = add_joint_angles(body, motion, angles)
-    return bend_at_hips(body, motion, options.lean_deg) if options.lean_deg else motion
+    if options.lean_deg:
+        motion = bend_at_hips(body, motion, options.lean_deg)
+    return film_alone(body, motion, ground_m, camera.centre_m()) if options.film_alone else motion
 
 
 def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
@@ -228,7 +248,9 @@ def build_capture(
     # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
     person_position_m = ground_m + start_offset_m * [1.0, 0.0, 1.0]
-    cameras = novel_cameras(camera, person_position_m, subject.body.height_m(), options.novel_views)
+    seen_from_m = ground_m if options.film_alone else person_position_m
+    distance_m = distance_to_middle_m(camera, seen_from_m, subject.body.height_m())
+    cameras = novel_cameras(camera, person_position_m, subject.body.height_m(), options.novel_views, distance_m)
     return capture, HeldOutTargets(cameras, build_novel_poses(options, subject.body, ground_m))
 
 

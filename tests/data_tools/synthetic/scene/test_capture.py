@@ -11,7 +11,7 @@ from data_tools.command import run_command
 from data_tools.sample import main
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.rig.subject import Subject, save_subject
-from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, portrait_camera
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION, distance_to_middle_m, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.movie import write_video
 from pipeline.body.files import load_camera, load_motion, save_body
 from pipeline.capture.video import open_frame_source, read_frames
@@ -70,7 +70,8 @@ def test_novel_views_show_the_whole_person(sample: Path) -> None:
 def test_cameras_are_rigid_and_centred() -> None:
     camera, ground_m = portrait_camera(540, 1.8, 3.6, 0.8)
     middle = torch.from_numpy(ground_m + [0.0, 0.9, 0.0])[None].float()
-    for novel in novel_cameras(camera, ground_m, 1.8, 5):
+    distance_m = distance_to_middle_m(camera, ground_m, 1.8)
+    for novel in novel_cameras(camera, ground_m, 1.8, 5, distance_m):
         rotation = novel.world_to_camera[:3, :3]
         assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
         assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-6)
