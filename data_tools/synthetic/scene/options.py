@@ -77,7 +77,10 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         help="forward bend of the person at the hips in all frames, degrees; the legs stay as they are",
     )
     parser.add_argument(
-        "--lower-arms-deg", type=float, default=0.0, help="angle by which both arms are lowered in all frames, degrees"
+        "--lower-arms-deg",
+        type=float,
+        default=0.0,
+        help="angle by which both arms are lowered in all frames, degrees; -40: a T-pose",
     )
     parser.add_argument(
         "--close-legs-deg", type=float, default=0.0, help="angle by which both legs are closed in all frames, degrees"
@@ -129,7 +132,7 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("roll_deg", -45.0, 45.0),
         ("hand_held_deg", 0.0, 10.0),
         ("lean_deg", -30.0, 60.0),
-        ("lower_arms_deg", 0.0, 60.0),
+        ("lower_arms_deg", -60.0, 60.0),
         ("close_legs_deg", 0.0, 20.0),
         ("specular", 0.0, 1.0),
         ("samples", 1, 8),
