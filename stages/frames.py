@@ -23,7 +23,7 @@ from pipeline.capture.input_checks import (
     assess_input,
     check_frames_that_differ,
     check_input,
-    is_cut_off,
+    lacks_head_or_feet,
     sample_scene_changes,
 )
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
@@ -129,15 +129,15 @@ def leave_out_cut_off(detections: Detections, path: Path, min_frames: int) -> De
 
     A person who films alone comes from the camera and goes back to it.
     """
-    is_poor = is_cut_off(detections)
-    unneeded = selection.find_replaceable(selection.body_yaw_rad(detections.landmarks_world_m), is_poor)
-    if not unneeded.any() or (detections.found & ~unneeded).sum() < min_frames:
+    is_poor = lacks_head_or_feet(detections)
+    replaceable = selection.find_replaceable(selection.body_yaw_rad(detections.landmarks_world_m), is_poor)
+    if not replaceable.any() or (detections.found & ~replaceable).sum() < min_frames:
         return detections
     warn(
-        f"{unneeded.sum()} frames of {path} that cut off the person are left out, others show the same side: "
-        f"{selection.format_frame_ranges(detections.frame_index, unneeded)}"
+        f"{replaceable.sum()} frames of {path} that cut off the person are left out, others show the same side: "
+        f"{selection.format_frame_ranges(detections.frame_index, replaceable)}"
     )
-    return detections.rows(~unneeded)
+    return detections.rows(~replaceable)
 
 
 def stabilise_camera(detections: Detections, source: FrameSource, user_files: UserFiles) -> tuple[Detections, float]:

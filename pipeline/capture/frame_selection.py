@@ -145,7 +145,7 @@ def body_yaw_rad(landmarks_world_m: Float[np.ndarray, "n 33 3"]) -> Float[np.nda
 
 
 def find_replaceable(yaw_rad: Float[np.ndarray, "n"], is_poor: Bool[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Return the poor frames that are not needed: others show the person from the same side.
+    """Return the poor frames that others replace, because they show the person from the same side.
 
     yaw_rad: of the torso, from `body_yaw_rad`; nan where unknown.
     """

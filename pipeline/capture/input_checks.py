@@ -95,8 +95,8 @@ def are_feet_cut_off(detections: Detections) -> Bool[np.ndarray, "n"]:
     return lowest_px > (1.0 - _SOLE_HEIGHT_FRACTION) * detections.height
 
 
-def is_cut_off(detections: Detections) -> Bool[np.ndarray, "n"]:
-    """Return whether head or feet are beyond the picture: the mask reaches its top over the nose, or the feet are cut.
+def lacks_head_or_feet(detections: Detections) -> Bool[np.ndarray, "n"]:
+    """Return whether head or feet are beyond the picture: the mask reaches its top over the nose, or a foot is below.
 
     Hands at its sides do not count.
     """

@@ -118,7 +118,7 @@ def test_yaw_of_a_turned_torso(yaw_deg):
     assert np.cos(difference) == pytest.approx(1, abs=1e-6)
 
 
-def test_poor_frames_are_not_needed_where_others_show_the_same_side():
+def test_poor_frames_are_replaceable_where_others_show_the_same_side():
     """A turn in steps of 5 degrees whose first quarter is poor: only its ends have three good neighbours."""
     yaw_rad = np.radians(np.arange(0.0, 360.0, 5.0))
     is_poor = yaw_rad < np.radians(89.0)

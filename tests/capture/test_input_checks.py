@@ -9,7 +9,7 @@ import pytest
 from pipeline.capture.detection import Detections
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
-from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input, is_cut_off
+from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input, lacks_head_or_feet
 from pipeline.capture.landmarks import PoseLandmark
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
@@ -48,7 +48,7 @@ def changed(good: Detections, name: str, where, value) -> Detections:
     return dataclasses.replace(good, **{name: array})
 
 
-def test_a_person_without_head_or_feet_is_cut_off(good):
+def test_a_person_without_head_or_feet_lacks_head_or_feet(good):
     """Columns of the mask are 5 px wide, the nose is at x = 50; the feet end at y = 50 of 100."""
     masks = good.person_masks.copy()
     masks[:, 0] = False
@@ -56,7 +56,7 @@ def test_a_person_without_head_or_feet_is_cut_off(good):
     frames = changed(changed(good, "person_masks", slice(None), masks), "landmarks_px", (4, 31, 1), 101.0)
     frames = changed(frames, "landmarks_px", (5, PoseLandmark.NOSE, 1), -1.0)
     frames = changed(frames, "landmarks_px", 6, np.nan)
-    np.testing.assert_array_equal(np.flatnonzero(is_cut_off(frames)), [1, 4, 5])
+    np.testing.assert_array_equal(np.flatnonzero(lacks_head_or_feet(frames)), [1, 4, 5])
 
 
 def test_good_recording_passes_without_warning(good):

@@ -158,7 +158,7 @@ def portrait_camera(
 
 def distance_to_middle_m(camera: Camera, person_position_m: np.ndarray, height_m: float) -> float:
     """Return the distance from a camera to the middle of a body; see `novel_cameras`."""
-    return float(np.linalg.norm(person_position_m + [0.0, 0.5 * height_m, 0.0] - camera.centre_m()))
+    return float(np.linalg.norm(_middle_m(person_position_m, height_m) - camera.centre_m()))
 
 
 def novel_cameras(
@@ -170,14 +170,20 @@ def novel_cameras(
 
     Args:
         person_position_m: point on the ground where the person stands in the rendered pose (world).
+        distance_m: from each camera to the middle of the body.
     """
-    middle = person_position_m + [0.0, 0.5 * height_m, 0.0]
+    middle = _middle_m(person_position_m, height_m)
     azimuths_rad = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
     elevations_rad = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
     return tuple(
         replace(camera, world_to_camera=_orbit_world_to_camera(middle, distance_m, azimuth_rad, elevation_rad))
         for azimuth_rad, elevation_rad in zip(azimuths_rad, elevations_rad, strict=True)
     )
+
+
+def _middle_m(person_position_m: np.ndarray, height_m: float) -> np.ndarray:
+    """Return the middle of a body that stands at a point on the ground."""
+    return person_position_m + [0.0, 0.5 * height_m, 0.0]
 
 
 def _orbit_world_to_camera(
