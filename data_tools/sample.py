@@ -9,6 +9,7 @@ from pathlib import Path
 
 from data_tools.command import run_command
 from data_tools.folder import require_absent
+from data_tools.synthetic.person.attachment import ATTACHMENTS
 from data_tools.synthetic.person.outfit import HEM_FLARE_M, LEGWEAR
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.scene.capture import write_capture
@@ -39,6 +40,7 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--sleeve-flare-m", type=float, default=0.0, help="widening of the sleeves to the hem, metres")
     parser.add_argument("--finger-mm", type=float, help="width of the fingers, mm; that of the person if absent")
+    parser.add_argument("--attachment", choices=sorted(ATTACHMENTS), help="what stands off the person")
     for name in PHENOTYPES:
         parser.add_argument(f"--{name}", type=float, help=f"Anny's {name}, 0 to 1; that of the seed if absent")
     options = parser.parse_args(argv)
@@ -50,7 +52,14 @@ def main(argv: Sequence[str]) -> None:
     finger_m = None if options.finger_mm is None else 1e-3 * options.finger_mm
     phenotypes = {name: vars(options)[name] for name in PHENOTYPES if vars(options)[name] is not None}
     subject, bare = make_person(
-        options.seed, options.texture, options.legwear, flare_m, options.sleeve_flare_m, finger_m, phenotypes
+        options.seed,
+        options.texture,
+        options.legwear,
+        flare_m,
+        options.sleeve_flare_m,
+        finger_m,
+        phenotypes,
+        options.attachment,
     )
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene)

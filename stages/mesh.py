@@ -381,7 +381,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=54,
+    version=55,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from data_tools.synthetic.person.surface import face_components
 from pipeline.body.body import AnnyBody, Body
 
-SKIN, EYE, TONGUE, SKIRT = 0, 1, 2, 3
-"""Labels of the connected components of the clothed surface; the body itself has no SKIRT."""
+SKIN, EYE, TONGUE, SKIRT, ATTACHMENT = 0, 1, 2, 3, 4
+"""Labels of the connected components of the clothed surface; the body itself has no SKIRT and no ATTACHMENT."""
 
 _ARM_JOINTS = ("Arm", "ForeArm", "Hand")
 _MOUTH_UV = (0.909, 0.483)

@@ -3,7 +3,7 @@
 The surface of the body is subdivided, smoothed where cloth does not follow it (navel, shoulder blades), displaced along
 its normals by thickness and folds of each layer, and keeps the skin weights of the body. This is done twice: in the
 second pass, cuts are measured on the smooth surface of the first pass, so that hems and prints are straight. A skirt is
-a second closed surface around the legs.
+a second closed surface around the legs, and so is each kind of `data_tools.synthetic.person.attachment`.
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +13,13 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int, Shaped
 from scipy.spatial import ConvexHull
 
-from data_tools.synthetic.person.anatomy import SKIN, SKIRT, Anatomy, compute_arm_head_weights, label_faces
+from data_tools.synthetic.person.anatomy import ATTACHMENT, SKIN, SKIRT, Anatomy, compute_arm_head_weights, label_faces
+from data_tools.synthetic.person.attachment import ATLAS_HEIGHT_FRACTION as ATTACHMENT_FRACTION
+from data_tools.synthetic.person.attachment import HAIRSTYLES, AttachmentMesh, build_attachment
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m, sleeve_flare_offset_m
-from data_tools.synthetic.person.skirt import ATLAS_HEIGHT_FRACTION, build_skirt
+from data_tools.synthetic.person.skirt import ATLAS_HEIGHT_FRACTION as SKIRT_FRACTION
+from data_tools.synthetic.person.skirt import SkirtMesh, build_skirt
 from data_tools.synthetic.person.surface import (
     append_midpoint_values,
     hull_exit_distance_m,
@@ -48,7 +51,7 @@ class ClothedSurface:
     Attributes:
         drape_m: vertex positions on which the cuts of `compute_layer_depths_m` were measured.
         arm_head_weights: skin weights on the arms and on the head.
-        labels: SKIN, EYE, TONGUE or SKIRT of each face.
+        labels: SKIN, EYE, TONGUE, SKIRT or ATTACHMENT of each face.
     """
 
     body: Body
@@ -84,7 +87,16 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
     clothed = ClothedSurface(
         clothed_body, append_midpoint_values(model.uv, uv_pairs), faces_uv, drape, arm_head_weights, labels
     )
-    return _add_skirt(clothed, anatomy, noise, outfit.hem_flare_m) if outfit.legwear == "skirt" else clothed
+    added: list[tuple[SkirtMesh | AttachmentMesh, int, float]] = []
+    if outfit.legwear == "skirt":
+        skirt = build_skirt(clothed_body, arm_head_weights[:, 0], anatomy, noise, outfit.hem_flare_m)
+        added.append((skirt, SKIRT, SKIRT_FRACTION))
+    if outfit.attachment is not None:
+        attachment = build_attachment(outfit.attachment, clothed_body, anatomy, noise)
+        added.append((attachment, ATTACHMENT, ATTACHMENT_FRACTION))
+    for mesh, label, atlas_fraction in added:
+        clothed = _add_surface(clothed, mesh, label, atlas_fraction)
+    return clothed
 
 
 def surface_names(person: ClothedSurface, anatomy: Anatomy, outfit: Outfit) -> Shaped[np.ndarray, "f"]:
@@ -94,26 +106,28 @@ def surface_names(person: ClothedSurface, anatomy: Anatomy, outfit: Outfit) -> S
     for column, layer in enumerate(LAYERS):
         names[(depths_m[:, :, column].mean(axis=1) > 0.0) & (person.labels == SKIN)] = layer
     names[person.labels == SKIRT] = "skirt"
+    names[person.labels == ATTACHMENT] = "hair" if outfit.attachment in HAIRSTYLES else outfit.attachment
     return names
 
 
-def _add_skirt(person: ClothedSurface, anatomy: Anatomy, noise: ValueNoise, hem_flare_m: float) -> ClothedSurface:
-    """Add the skirt; the UV charts of the body are scaled down to free the top of the atlas."""
-    skirt_mesh = build_skirt(person.body, person.arm_head_weights[:, 0], anatomy, noise, hem_flare_m)
+def _add_surface(
+    person: ClothedSurface, mesh: SkirtMesh | AttachmentMesh, label: int, atlas_fraction: float
+) -> ClothedSurface:
+    """Add a separate surface; the UV charts of others are scaled down to free the top of the atlas."""
     worn, start, start_uv = person.body, len(person.body.vertices), len(person.uv)
     body = replace(
         worn,
-        vertices=np.concatenate([worn.vertices, skirt_mesh.vertices]),
-        faces=np.concatenate([worn.faces, skirt_mesh.faces + start]),
-        skin_weights=np.concatenate([worn.skin_weights, skirt_mesh.skin_weights]),
+        vertices=np.concatenate([worn.vertices, mesh.vertices]),
+        faces=np.concatenate([worn.faces, mesh.faces + start]),
+        skin_weights=np.concatenate([worn.skin_weights, mesh.skin_weights]),
     )
     return ClothedSurface(
         body=body,
-        uv=np.concatenate([person.uv * np.array([1.0, 1.0 - ATLAS_HEIGHT_FRACTION], np.float32), skirt_mesh.uv]),
-        faces_uv=np.concatenate([person.faces_uv, skirt_mesh.faces_uv + start_uv]),
-        drape_m=np.concatenate([person.drape_m, skirt_mesh.vertices]),
-        arm_head_weights=np.concatenate([person.arm_head_weights, np.zeros((len(skirt_mesh.vertices), 2), np.float32)]),
-        labels=np.concatenate([person.labels, np.full(len(skirt_mesh.faces), SKIRT, person.labels.dtype)]),
+        uv=np.concatenate([person.uv * np.array([1.0, 1.0 - atlas_fraction], np.float32), mesh.uv]),
+        faces_uv=np.concatenate([person.faces_uv, mesh.faces_uv + start_uv]),
+        drape_m=np.concatenate([person.drape_m, mesh.vertices]),
+        arm_head_weights=np.concatenate([person.arm_head_weights, np.zeros((len(mesh.vertices), 2), np.float32)]),
+        labels=np.concatenate([person.labels, np.full(len(mesh.faces), label, person.labels.dtype)]),
     )
 
 

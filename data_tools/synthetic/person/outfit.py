@@ -33,6 +33,7 @@ class Outfit:
         plaid: second colour of the skirt.
         hem_flare_m: additional radius of the skirt at the hem, compared with cloth that falls straight.
         sleeve_flare_m: additional radius of the sleeves at their hem.
+        attachment: one of `data_tools.synthetic.person.attachment.ATTACHMENTS`.
     """
 
     legwear: str
@@ -50,6 +51,7 @@ class Outfit:
     print_text: str
     hem_flare_m: float = HEM_FLARE_M
     sleeve_flare_m: float = 0.0
+    attachment: str | None = None
 
 
 _SHIRTS: tuple[tuple[Colour, Colour], ...] = (

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from data_tools.synthetic.person.anatomy import EYE, SKIRT, TONGUE, Anatomy
+from data_tools.synthetic.person.anatomy import ATTACHMENT, EYE, SKIRT, TONGUE, Anatomy
+from data_tools.synthetic.person.attachment import HAIRSTYLES
 from data_tools.synthetic.person.dressing import ClothedSurface
 from data_tools.synthetic.person.face import paint_eyes, paint_skin
 from data_tools.synthetic.person.noise import ValueNoise
@@ -85,6 +86,9 @@ def _texel_colours(texels: Texels, anatomy: Anatomy, outfit: Outfit, noise: Valu
     colours[texels.labels == TONGUE] = (0.55, 0.25, 0.25)
     rows = texels.labels == SKIRT
     colours[rows] = _paint_skirt(texels.points_m[rows], anatomy, outfit, noise)
+    rows = texels.labels == ATTACHMENT
+    paint = _paint_hair if outfit.attachment in HAIRSTYLES else _paint_cotton
+    colours[rows] = paint(texels.points_m[rows], depths[rows, 0], anatomy, outfit, noise)
     return np.clip(colours, 0.0, 1.0)
 
 
@@ -213,6 +217,18 @@ def _paint_hair(
     """Colour hair with strands that run down and back from the crown."""
     strands = noise(points, (0.0028, 0.03, 0.03)) * 0.34 + noise(points + 5.0, (0.009, 0.05, 0.05)) * 0.28
     return _shaded(outfit.hair, 1.12 + strands)
+
+
+def _paint_cotton(
+    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
+) -> Float[np.ndarray, "n 3"]:
+    """Colour cotton with seams from the crown down."""
+    skull = anatomy.skull_m()
+    angle = np.arctan2(points[:, 2] - skull[2], points[:, 0] - skull[0])
+    colours = _shaded(outfit.stripe, 1.0 + noise(points, 0.003) * 0.05)
+    on_seam = (np.abs(np.mod(angle / np.pi * 3.0 + 0.5, 1.0) - 0.5) < 0.02) & (points[:, 1] > skull[1] + 0.05)
+    colours[on_seam] *= 0.7
+    return colours
 
 
 _PAINTERS = {"shoes": _paint_shoes, "trousers": _paint_trousers, "shirt": _paint_shirt, "hair": _paint_hair}

@@ -38,16 +38,19 @@ def make_person(
     sleeve_flare_m: float = 0.0,
     finger_width_m: float | None = None,
     phenotypes: Mapping[str, float] | None = None,
+    attachment: str | None = None,
 ) -> tuple[Subject, Body]:
     """Return the clothed, textured person of a seed, and the body without clothes.
 
     Equal seeds give equal arrays, whatever the number of threads.
 
-    texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m: see `Outfit`. finger_width_m: None: that of
-    the person. phenotypes: of Anny, each in [0, 1]; others are those of the seed.
+    texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m, attachment: see `Outfit`. finger_width_m:
+    None: that of the person. phenotypes: of Anny, each in [0, 1]; others are those of the seed.
     """
     model, noise = load_anny(), ValueNoise(seed)
-    outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m)
+    outfit = replace(
+        choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m, attachment=attachment
+    )
     with torch_threads(1):
         bare = model.at_shape(_shape(model, seed, phenotypes or {}))
     if finger_width_m is not None:

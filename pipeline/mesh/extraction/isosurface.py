@@ -36,6 +36,8 @@ BODY_PADDING_VOXELS = 4
 """Samples around the body where the box of the density ends nearer to it."""
 HAND_REACH_M = 0.12
 """Density up to this distance from the body belongs to a hand where a hand is nearest, m."""
+VOID_OPENING_RADIUS_M = 0.025
+"""Radius of the ball that cannot roll into a void, m."""
 DISTANCE_GRID_STRIDE = 4
 HAND_NARROW_BAND_VOXELS = 4.0
 GRID_SIZE_MULTIPLE = 8
@@ -156,6 +158,7 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     hand = _clipped_ramp(-samples.body_distance_m[hands], ramp_m)
     value[hands] += samples.hand_weight[hands] * (hand - value[hands])
     np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples), out=value)
+    np.maximum(value, _fill_voids(value >= SURFACE_ISOVALUE, samples), out=value)
     value *= 1.0 - samples.emptiness
     np.minimum(value, parted_legs(samples), out=value)
     value[excess_between_legs(value >= SURFACE_ISOVALUE, samples)] = 0.0
@@ -269,6 +272,29 @@ def _close_skirt(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> F
         return np.zeros(inside.shape, dtype=np.float32)
     near = ndimage.binary_dilation(gaps, iterations=2)
     return upsample(near * ndimage.gaussian_filter((solid | gaps).astype(np.float64), 0.7), inside.shape)
+
+
+def _fill_voids(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
+    """Return an indicator in [0, 1] of voids into which a ball of `VOID_OPENING_RADIUS_M` cannot roll from outside.
+
+    No ray ends inside voluminous hair, and a camera at the height of the chest does not see its top: the density is a
+    shell with holes there. Computed on every second sample above the crotch.
+    """
+    coarse, solid = samples.downsampled(), inside[::2, ::2, ::2]
+    upper = np.s_[:, max(0, round((coarse.crotch_m - coarse.origin_m[1]) / coarse.spacing_m)) :]
+    radius = VOID_OPENING_RADIUS_M / coarse.spacing_m
+    padded = np.pad(solid[upper], 1 + int(np.ceil(radius)))
+    rooms, count = ndimage.label(ndimage.distance_transform_edt(~padded) > radius)
+    if count < 2:
+        return np.zeros(inside.shape, dtype=np.float32)
+    is_outside = rooms == rooms[0, 0, 0]
+    is_void = (rooms > 0) & ~is_outside
+    unreachable = ndimage.distance_transform_edt(~is_outside) > radius
+    filled = np.zeros_like(solid)
+    middle = (slice(1 + int(np.ceil(radius)), -1 - int(np.ceil(radius))),) * 3
+    filled[upper] = (unreachable & (ndimage.distance_transform_edt(~is_void) <= 2.0 * radius))[middle]
+    near = ndimage.binary_dilation(filled, iterations=2)
+    return upsample(near * ndimage.gaussian_filter((solid | filled).astype(np.float64), 0.7), inside.shape)
 
 
 def upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:

@@ -1,5 +1,6 @@
 """Extraction from analytic densities around a capsule: empty interiors, floaters, concavities and hands."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import is_closed_manifold
 from pipeline.mesh.extraction.isosurface import (
+    SURFACE_ISOVALUE,
     extract_mesh,
     hand_skin_weights,
     indicator_grid,
@@ -70,6 +72,31 @@ def test_concavities_are_filled_inside_the_body_only(body: Body) -> None:
         value = indicator[column[0], :, column[2]]
         assert (value[np.abs(heights) < filled_to - 0.015] >= 0.5).all()
         assert (value[np.abs(heights) > filled_to + 0.015] < 0.5).all()
+
+
+def test_a_void_that_narrow_openings_lead_to_is_filled(body: Body) -> None:
+    """A hollow ball of hair whose top has an opening, 4 or 14 cm wide; gaps between a thin tail and the trunk stay."""
+
+    def hair_density(opening_m: float) -> Callable[[Tensor], Tensor]:
+        def density(points: Tensor) -> Tensor:
+            from_middle = points - torch.tensor([-0.15, 0.66, 0.0])
+            shell = (from_middle.norm(dim=1) - 0.14).abs() < 0.015
+            opening = (from_middle[:, 1] > 0.0) & (from_middle[:, [0, 2]].norm(dim=1) < 0.5 * opening_m)
+            tail = (points - torch.tensor([0.1, 0.5, 0.16])).abs() < torch.tensor([0.1, 0.03, 0.02])
+            return torch.where((shell & ~opening) | tail.all(dim=1), 300.0, 0.0)
+
+        return density
+
+    bounds_m = BOUNDS_M + np.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]], np.float32)
+    settings = replace(WITHOUT_HANDS, blur_sigma_voxels=0.0, closing_radius_m=0.0)
+    for opening_m, is_filled in ((0.04, True), (0.14, False)):
+        samples = sample_canonical_grid(hair_density(opening_m), bounds_m, body, 0.01, settings)
+        solid = indicator_grid(samples, 50.0, settings) >= SURFACE_ISOVALUE
+        void, top, gap = (
+            solid[tuple(((point_m - samples.origin_m) / 0.01).round().astype(int))]
+            for point_m in np.array([[-0.15, 0.7, 0.0], [-0.15, 0.79, 0.0], [0.1, 0.5, 0.12]])
+        )
+        assert (void, top, gap) == (is_filled, is_filled, False)
 
 
 def test_hand_weights_sum_over_every_joint_of_a_hand(body: Body) -> None:
