@@ -5,12 +5,13 @@ python -m data_tools.sample OUT [--frames 96 --size 540 --seed 0 --legwear skirt
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from data_tools.command import run_command
 from data_tools.folder import require_absent
 from data_tools.synthetic.person.attachment import ATTACHMENTS
-from data_tools.synthetic.person.outfit import HEM_FLARE_M, LEGWEAR
+from data_tools.synthetic.person.outfit import HEM_FLARE_M, LEGWEAR, choose_outfit
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.scene.capture import write_capture
 from data_tools.synthetic.scene.options import (
@@ -38,6 +39,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--flare-m", type=float, help="widening of the skirt from waist to hem in metres; 0.07 if absent"
     )
+    parser.add_argument("--hem-m", type=float, help="height of the hem of the skirt, metres; above the knees if absent")
     parser.add_argument("--sleeve-flare-m", type=float, default=0.0, help="widening of the sleeves to the hem, metres")
     parser.add_argument("--finger-mm", type=float, help="width of the fingers, mm; that of the person if absent")
     parser.add_argument("--attachment", choices=sorted(ATTACHMENTS), help="what stands off the person")
@@ -45,22 +47,19 @@ def main(argv: Sequence[str]) -> None:
         parser.add_argument(f"--{name}", type=float, help=f"Anny's {name}, 0 to 1; that of the seed if absent")
     options = parser.parse_args(argv)
     validate_capture_options(options)
-    if options.flare_m is not None and options.legwear != "skirt":
-        raise UserError("--flare-m widens a skirt; add --legwear skirt")
+    if options.legwear != "skirt" and (options.flare_m is not None or options.hem_m is not None):
+        raise UserError("--flare-m and --hem-m are of a skirt; add --legwear skirt")
     require_absent(options.out)
-    flare_m = HEM_FLARE_M if options.flare_m is None else options.flare_m
     finger_m = None if options.finger_mm is None else 1e-3 * options.finger_mm
     phenotypes = {name: vars(options)[name] for name in PHENOTYPES if vars(options)[name] is not None}
-    subject, bare = make_person(
-        options.seed,
-        options.texture,
-        options.legwear,
-        flare_m,
-        options.sleeve_flare_m,
-        finger_m,
-        phenotypes,
-        options.attachment,
+    outfit = replace(
+        choose_outfit(options.seed, options.legwear),
+        hem_flare_m=HEM_FLARE_M if options.flare_m is None else options.flare_m,
+        hem_m=options.hem_m,
+        sleeve_flare_m=options.sleeve_flare_m,
+        attachment=options.attachment,
     )
+    subject, bare = make_person(options.seed, options.texture, outfit, finger_m, phenotypes)
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene)
     capture, heldout = build_capture(options, subject, motion, scene)

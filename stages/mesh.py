@@ -56,6 +56,7 @@ from pipeline.mesh.remeshing import faces_by_part, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_relaxation import move_along, relax_skin
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
+from pipeline.mesh.soles import LevelSoles
 from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhouette_iou
 from pipeline.metrics.health import mesh_quality_metrics
@@ -167,16 +168,17 @@ def run(
     if state.pose_offsets:
         motion = state.pose_offsets.of(body, motion.select(chosen[0])).apply(motion)
     shader, psnr_db = aligned.shader, state.validation_psnr_db
-    bare = load_body(inputs["body"] / "bare.npz")
-    finished = finish_mesh(state, aligned, bare, config.max_final_faces)
+    finished = finish_mesh(state, aligned, load_body(inputs["body"] / "bare.npz"), config.max_final_faces)
     relaxed = relax_skin(finished.mesh, finished.skin, body, aligned.train)
-    save_dense_mesh(out, move_along(finished.dense, finished.mesh, relaxed.mesh))
     mesh, skin = relaxed.mesh, relaxed.skin
-    write_results(out, mesh, skin, shader, finished.is_inside)
     final_motion, motion_metrics = align_other_frames(
         capture, inputs, (body, motion), (mesh, skin, shader), aligned.validation
     )
-    save_motion(out / "motion.npz", final_motion)
+    soles = LevelSoles.of(mesh, skin.weights, body, motion.select(parts[0]))
+    level = soles.turn_mesh(mesh, skin.weights, body, motion.select(parts[0]))
+    save_dense_mesh(out, move_along(finished.dense, finished.mesh, level))
+    write_results(out, mesh, (level, soles), skin, shader, finished.is_inside)
+    save_motion(out / "motion.npz", soles.turn_motion_back(final_motion, body))
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
         "initial_validation_psnr_db": psnr_db[0],
@@ -305,7 +307,6 @@ def load_views(
     """Load crops of the frames at these positions, in their poses of the motion."""
     camera = load_camera(inputs["body"] / "camera.npz")
     poses = canonical_to_world(body, motion.select(positions))
-
     pool = shared_thread_pool(torch.get_num_threads())
 
     def load_view(row: int) -> PosedView:
@@ -367,21 +368,27 @@ def align_other_frames(
 
 
 def write_results(
-    out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn.Module, is_inside: Bool[np.ndarray, "v"] | None
+    out: Path,
+    mesh: Mesh,
+    level: tuple[Mesh, LevelSoles],
+    skin: SkinnedTopology,
+    shader: torch.nn.Module,
+    is_inside: Bool[np.ndarray, "v"] | None,
 ) -> None:
     """Write the mesh with its skin and vertex colours, and the turntable preview.
 
-    is_inside: vertices inside of a skirt or coat; None without one.
+    mesh: as the shader knows it. level: it with level soles, and its rotations. is_inside: see `MeshArtifact`.
     """
     with torch.no_grad():
         vertex_colours = shader(torch.from_numpy(mesh.vertices)).numpy()
-    save_mesh(out, MeshArtifact(mesh, *top_k_weights(skin.weights.numpy()), vertex_colours, is_inside=is_inside))
+    weights = top_k_weights(skin.weights.numpy())
+    save_mesh(out, MeshArtifact(level[0], *weights, vertex_colours, is_inside=is_inside, soles=level[1]))
     write_rgb(out / "preview.png", turntable_sheet(mesh, shader))
 
 
 STAGE = Stage(
     "mesh",
-    version=55,
+    version=56,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

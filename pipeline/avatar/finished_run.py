@@ -21,6 +21,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.creases import find_creases
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.files import load_mesh
+from pipeline.mesh.soles import LevelSoles
 from pipeline.texture.files import TextureArtifact, load_texture
 from pipeline.texture.light import VertexGloss
 
@@ -37,7 +38,7 @@ class FinishedRun:
             aligned to the outline of the mesh.
         field_renderer: renders the field with `camera`.
         refined_canonical_to_world: skinning matrices of `motion`.
-        fitted_canonical_to_world: skinning matrices of the body stage's motion.
+        fitted_canonical_to_world: skinning matrices of the body stage's motion, for the mesh with level soles.
     """
 
     capture: Capture
@@ -60,16 +61,17 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
     """
     body = load_body(inputs["body"] / "body.npz")
     camera = load_camera(inputs["body"] / "camera.npz")
-    motion = load_motion(inputs["mesh"] / "motion.npz")
+    motion, soles = load_motion(inputs["mesh"] / "motion.npz"), load_mesh(inputs["mesh"]).soles
+    fitted = soles.turn_motion_back(load_motion(inputs["body"] / "motion.npz"), body)
     return FinishedRun(
         capture=load_capture(inputs["frames"]),
         camera=camera,
         body=body,
         motion=motion,
         avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
-        field_renderer=_make_field_renderer(inputs["field"], body, camera),
+        field_renderer=_make_field_renderer(inputs["field"], soles, body, camera),
         refined_canonical_to_world=canonical_to_world(body, motion),
-        fitted_canonical_to_world=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
+        fitted_canonical_to_world=canonical_to_world(body, fitted),
     )
 
 
@@ -110,12 +112,15 @@ def vertex_values(texture: Float32[np.ndarray, "th tw"], atlas: Atlas, vertex_co
     return total / torch.from_numpy(np.maximum(np.bincount(atlas.vertex_of_uv, minlength=vertex_count), 1)).float()
 
 
-def _make_field_renderer(field_dir: Path, body: Body, camera: Camera) -> PoseRenderer:
+def _make_field_renderer(field_dir: Path, soles: LevelSoles, body: Body, camera: Camera) -> PoseRenderer:
+    """Return a renderer of the field in poses of the mesh, whose soles were turned."""
     field = load_field(field_dir / "field.safetensors")
     occupancy = load_occupancy(field_dir / "occupancy.npz")
     skin = build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
 
+    to_mesh = soles.transforms(body)
+
     def render_pose(canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return render_field(field, occupancy, body, canonical_to_world, camera, skin).numpy()
+        return render_field(field, occupancy, body, canonical_to_world @ to_mesh, camera, skin).numpy()
 
     return render_pose

@@ -49,6 +49,9 @@ HEIGHT_STEP, HIGHEST, LOWEST = 0.025, 0.1, 1.9
 HEIGHTS = HIGHEST + HEIGHT_STEP * np.arange(round((LOWEST - HIGHEST) / HEIGHT_STEP) + 1)
 """Heights that are looked at, as of `Body.height_on_legs_m`, nearly to the ankles."""
 
+FOOT_HEIGHTS = HEIGHTS[-1] + HEIGHT_STEP * np.arange(1, 18)
+"""Heights below them, to the soles and beyond, at which only cloth down to the floor is looked for."""
+
 JUDGED_FROM, JUDGED_TO = 0.29, 1.41
 """Heights that tell a skirt. Above, thighs touch anyway, and a hem is that of a shirt; below, trousers touch."""
 
@@ -88,6 +91,7 @@ class LegProfile:
         half_width_m: half the width of the legs with their margins, median over frames; nan where no frame shows it.
         slope: tangent of the angle at which the camera sees a horizontal plane at each height, median over frames.
         thigh_m: height of the hips above the knees in the A-pose: the unit of `HEIGHTS`.
+        floor_hem: where cloth that hangs between the legs at the lowest of `HEIGHTS` ends, in their unit.
     """
 
     margin_m: Float[np.ndarray, "k"]
@@ -96,6 +100,7 @@ class LegProfile:
     half_width_m: Float[np.ndarray, "k"]
     slope: Float[np.ndarray, "k"]
     thigh_m: float
+    floor_hem: float = LOWEST
 
     def cloth_hangs_between_legs(self) -> bool:
         """Return whether a skirt or coat goes from leg to leg.
@@ -125,7 +130,13 @@ class LegProfile:
         There the margin falls to half, or the background begins to be seen between the legs. Cloth down to the floor
         ends at the lowest of the heights.
         """
-        return HIGHEST + HEIGHT_STEP * (self._rows_at_hem()[1] - 0.5) if self.cloth_hangs_between_legs() else None
+        if not self.cloth_hangs_between_legs():
+            return None
+        return self.floor_hem if self.reaches_floor() else HIGHEST + HEIGHT_STEP * (self._rows_at_hem()[1] - 0.5)
+
+    def reaches_floor(self) -> bool:
+        """Return whether cloth hangs between the legs down to the lowest of `HEIGHTS`."""
+        return self.cloth_hangs_between_legs() and self._rows_at_hem()[1] == len(HEIGHTS)
 
     def hem_height(self) -> float | None:
         """Return the height of the hem of a skirt or coat, in the unit of `HEIGHTS`; None without one.
@@ -155,6 +166,8 @@ class LegProfile:
 
     def stands_off(self) -> bool:
         """Return whether there is a skirt that stands off the legs at its hem."""
+        if self.reaches_floor():
+            return bool(self.gap_px[-1] >= WIDE_GAP_PX)
         return self.cloth_hangs_between_legs() and float(self._step_m().max()) >= MIN_SKIRT_STEP_M
 
     def _step_m(self) -> Float[np.ndarray, "k"]:
@@ -189,17 +202,20 @@ def leg_profile(
     found = np.flatnonzero(frames & np.array([window is not None for window in windows]))
     chosen = found[evenly_spaced(len(found), JUDGED_FRAMES)]
     legs = np.stack([_leg_faces(body, side) for side in LEGS])
-    rows = np.full((5, len(chosen), len(HEIGHTS)), np.nan)
+    rows = np.full((5, len(chosen), len(HEIGHTS) + len(FOOT_HEIGHTS)), np.nan)
     for k, pose in enumerate(canonical_to_world(body, motion.select(chosen))):
         window = windows[chosen[k]]
         if window is not None:
             rows[:, k] = _profile_of_frame(body, legs, pose, camera, window)
     seen = np.isfinite(rows[0]).any(axis=0)
-    medians = np.full((3, len(HEIGHTS)), np.nan)
+    medians = np.full((3, rows.shape[2]), np.nan)
     medians[:, seen] = np.nanmedian(rows[[0, 3, 4]][..., seen], axis=1)
     gap_px, open_px = np.nansum(rows[1:3], axis=1) / max(1, len(chosen))
     thigh_m = body.height_on_legs_m(0.0) - body.height_on_legs_m(1.0)
-    return LegProfile(medians[0], gap_px, open_px, medians[1], medians[2], thigh_m)
+    hangs = (gap_px >= 1.0) & (open_px < MIN_OPEN_SHARE * gap_px)
+    floor_hem = LOWEST + HEIGHT_STEP * (int(np.argmin(np.append(hangs[len(HEIGHTS) :], False))) + 0.5)
+    k = len(HEIGHTS)
+    return LegProfile(medians[0, :k], gap_px[:k], open_px[:k], medians[1, :k], medians[2, :k], thigh_m, floor_hem)
 
 
 def _profile_of_frame(
@@ -211,8 +227,9 @@ def _profile_of_frame(
     is_body = face_id >= 0
     left, right = legs[:, np.maximum(face_id, 0)] & is_body
     metres_per_px = body.height_m() / window.person_px
-    profile, slope = np.full((5, len(HEIGHTS)), np.nan), _slopes(body, pose, camera)
-    for k, row in enumerate(rows_on_legs(HEIGHTS, body, pose, camera, window)):
+    heights = np.concatenate([HEIGHTS, FOOT_HEIGHTS])
+    profile, slope = np.full((5, len(heights)), np.nan), _slopes(heights, body, pose, camera)
+    for k, row in enumerate(rows_on_legs(heights, body, pose, camera, window)):
         if not (0 <= row < len(face_id) and left[row].any() and right[row].any()):
             continue
         columns = sorted((np.flatnonzero(left[row]), np.flatnonzero(right[row])), key=np.mean)
@@ -227,11 +244,13 @@ def _profile_of_frame(
     return profile
 
 
-def _slopes(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera) -> Float[np.ndarray, "k"]:
-    """Return the tangents of the angles at which the camera sees the planes across the legs at `HEIGHTS`."""
+def _slopes(
+    heights: Float[np.ndarray, "k"], body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera
+) -> Float[np.ndarray, "k"]:
+    """Return the tangents of the angles at which the camera sees the planes across the legs at some heights."""
     hip_m, knee_m = _hips_and_knees_m(body, pose).mean(axis=1)
     up = (hip_m - knee_m) / np.linalg.norm(hip_m - knee_m)
-    to_camera_m = camera.centre_m() - (hip_m + HEIGHTS[:, None] * (knee_m - hip_m))
+    to_camera_m = camera.centre_m() - (hip_m + heights[:, None] * (knee_m - hip_m))
     above_m = to_camera_m @ up
     return np.abs(above_m) / np.linalg.norm(to_camera_m - above_m[:, None] * up, axis=1)
 

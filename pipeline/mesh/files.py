@@ -19,6 +19,7 @@ from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.mesh.pose_alignment import PoseOffsets
 from pipeline.mesh.refinement import RefinementState
 from pipeline.mesh.skin_transfer import build_skinned_topology
+from pipeline.mesh.soles import LevelSoles
 
 MESH_NPZ, DENSE_NPZ = "mesh.npz", "dense.npz"
 SHADER_STATE_PREFIX = "appearance."
@@ -31,7 +32,7 @@ class MeshArtifact:
     mesh: vertices in m (float32) and faces. joint_indices, joint_weights: up to four influences per vertex, the largest
     first, sum 1. vertex_colours: sRGB in [0, 1]. unsplit: how normals are found where triangles were split. creases:
     copies of vertices on folds, if these were made. is_inside: vertices inside of a skirt or coat; None without one.
-    unsplit and creases are not in the file.
+    soles: from the canonical pose of the field to that of the mesh. unsplit and creases are not in the file.
     """
 
     mesh: Mesh
@@ -41,6 +42,7 @@ class MeshArtifact:
     unsplit: UnsplitNormals | None = None
     creases: Creases | None = None
     is_inside: Bool[np.ndarray, "v"] | None = None
+    soles: LevelSoles = LevelSoles()
 
     def vertex_normals(self, posed: Float[np.ndarray, "v 3"] | None = None) -> Float[np.ndarray, "v 3"]:
         """Return unit normals of the surface as it was before its triangles were split, of each side of its folds.
@@ -84,6 +86,7 @@ class MeshArtifact:
             cut.extend(self.vertex_colours),
             UnsplitNormals(self.mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights),
             is_inside=None if self.is_inside is None else cut.extend_flags(self.is_inside),
+            soles=self.soles,
         )
 
     def split(self, creases: Creases) -> "MeshArtifact":
@@ -108,6 +111,7 @@ def save_mesh(folder: Path, artifact: MeshArtifact) -> None:
         "joint_indices": artifact.joint_indices.astype(np.int32),
         "joint_weights": artifact.joint_weights.astype(np.float32),
         "vertex_colors": artifact.vertex_colours.astype(np.float32),
+        "sole_rotations": artifact.soles.rotations,
     }
     if artifact.is_inside is not None:
         arrays["is_inside"] = artifact.is_inside
@@ -124,7 +128,13 @@ def load_mesh(folder: Path) -> MeshArtifact:
     try:
         mesh = Mesh(arrays["vertices"], arrays["faces"])
         skin = arrays["joint_indices"], arrays["joint_weights"]
-        return MeshArtifact(mesh, *skin, arrays["vertex_colors"], is_inside=arrays.get("is_inside"))
+        return MeshArtifact(
+            mesh,
+            *skin,
+            arrays["vertex_colors"],
+            is_inside=arrays.get("is_inside"),
+            soles=LevelSoles(arrays["sole_rotations"]),
+        )
     except KeyError as error:
         path = folder / MESH_NPZ
         raise UserError(f"{path} has no array {error}; run {rerun_command('mesh', folder)}") from None

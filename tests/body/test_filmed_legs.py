@@ -142,9 +142,14 @@ def test_long_skirts_end_at_their_hems(body: Body, hem_m: float) -> None:
     assert outline_hem_m(profile_of(body, dressed(body, hem_m, 14, True)), body) == pytest.approx(hem_m, abs=0.015)
 
 
-def test_cloth_down_to_the_floor_ends_at_the_lowest_height(body: Body) -> None:
-    profile = profile_of(body, dressed(body, 0.05, 14, True))
-    assert outline_hem_m(profile, body) == pytest.approx(body.height_on_legs_m(float(HEIGHTS[-1])), abs=0.01)
+@pytest.mark.parametrize("hem_m", [0.12, 0.05, 0.02])
+def test_cloth_down_to_the_floor_ends_where_masks_end(body: Body, hem_m: float) -> None:
+    """Below the ankles; the outline of such cloth says little of the legs."""
+    profile = profile_of(body, dressed(body, hem_m, 14, True))
+    assert profile.reaches_floor()
+    assert profile.stands_off()
+    assert outline_hem_m(profile, body) == pytest.approx(hem_m, abs=0.015)
+    assert not profile_of(body, dressed(body, 0.3, 14, True)).reaches_floor()
 
 
 def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:

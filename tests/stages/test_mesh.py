@@ -28,6 +28,7 @@ from pipeline.mesh.files import load_mesh
 from pipeline.mesh.pose_alignment import AlignedSurface
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin
+from pipeline.mesh.soles import LevelSoles
 from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, render_posed_view
 from stages import mesh as mesh_stage
@@ -306,7 +307,7 @@ def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -
     mesh = capsule_mesh(0.18)
     share = torch.linspace(0.0, 1.0, len(mesh.vertices))
     skin = build_skinned_topology(mesh, torch.stack([1 - share, share], dim=1))
-    mesh_stage.write_results(tmp_path, mesh, skin, FieldColours(CapsuleField()), None)
+    mesh_stage.write_results(tmp_path, mesh, (mesh, LevelSoles()), skin, FieldColours(CapsuleField()), None)
     exported = load_mesh(tmp_path).dense_skin_weights(2)
     np.testing.assert_allclose(exported[:, 1], share, atol=1e-6)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_tools.synthetic.person.outfit import choose_outfit
 from data_tools.synthetic.person.person import make_person
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
@@ -77,7 +78,7 @@ def test_short_hair_is_told_by_its_colour_and_a_bald_head_has_none() -> None:
 @pytest.mark.slow
 def test_skin_skirt_and_hair_are_told_apart() -> None:
     template, seed = load_template(), 3
-    subject, bare = make_person(seed, texture_px=64, legwear="skirt")
+    subject, bare = make_person(seed, 64, choose_outfit(seed, "skirt"))
     visible = np.ones(len(subject.body.faces), dtype=bool)
     visible[: 4 * len(template.skin_faces)] = np.repeat(template.skin_faces, 4)
     surface = Mesh(subject.body.vertices, subject.body.faces[visible])

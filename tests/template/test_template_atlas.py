@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from data_tools.synthetic.person.outfit import choose_outfit
 from data_tools.synthetic.person.person import make_person
 from pipeline.geometry.atlas import Atlas, rasterize_texels
 from pipeline.geometry.mesh import Mesh
@@ -116,7 +117,7 @@ def test_one_place_of_the_texture_is_the_same_place_on_two_people() -> None:
 @pytest.mark.slow
 def test_a_skirt_gets_charts_in_the_reserved_square() -> None:
     template = load_template()
-    subject, bare = make_person(SEEDS[0], texture_px=64, legwear="skirt")
+    subject, bare = make_person(SEEDS[0], 64, choose_outfit(SEEDS[0], "skirt"))
     visible = np.ones(len(subject.body.faces), dtype=bool)
     visible[: 4 * len(template.skin_faces)] = np.repeat(template.skin_faces, 4)
     surface = Mesh(subject.body.vertices, subject.body.faces[visible])

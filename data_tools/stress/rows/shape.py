@@ -79,6 +79,23 @@ SHAPE_ROWS = (
         unit="Chamfer on the shirt, mm",
     ),
     Row(
+        name="hair",
+        failure="long hair, a ponytail, an afro, a cap",
+        line="Chamfer at most 1 mm above short hair; at most 0.5 % of the area farther than 30 mm from the truth",
+        trials=(
+            turn_trial("short hair", 0),
+            *(
+                turn_trial(kind.replace("-", " "), k, {"attachment": kind})
+                for k, kind in enumerate(("long-hair", "ponytail", "afro", "cap"), 1)
+            ),
+        ),
+        crossed=all_of(
+            bounded_change("short hair", {"chamfer_mm": (None, 1.0)}), bounded("far_area_share", high=0.005)
+        ),
+        score="chamfer_mm",
+        unit="Chamfer, mm",
+    ),
+    Row(
         name="unseen-side",
         failure="a turn of 360, 270, 180 and 90° is filmed",
         line="no hole, no shard, fill near the body: at most 0.5 % of the area farther than 30 mm from the truth, and "
@@ -155,6 +172,6 @@ SHAPE_ROWS = (
         ),
         score="hand_recall",
         unit="recall of the hands at 5 mm",
-        missing="hair, of which the generator has one kind",
+        missing="strands of hair",
     ),
 )

@@ -89,7 +89,7 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
     )
     added: list[tuple[SkirtMesh | AttachmentMesh, int, float]] = []
     if outfit.legwear == "skirt":
-        skirt = build_skirt(clothed_body, arm_head_weights[:, 0], anatomy, noise, outfit.hem_flare_m)
+        skirt = build_skirt(clothed_body, arm_head_weights[:, 0], anatomy, noise, outfit)
         added.append((skirt, SKIRT, SKIRT_FRACTION))
     if outfit.attachment is not None:
         attachment = build_attachment(outfit.attachment, clothed_body, anatomy, noise)

@@ -33,6 +33,7 @@ class Outfit:
         plaid: second colour of the skirt.
         hem_flare_m: additional radius of the skirt at the hem, compared with cloth that falls straight.
         sleeve_flare_m: additional radius of the sleeves at their hem.
+        hem_m: height of the hem of the skirt above the floor; None: above the knees.
         attachment: one of `data_tools.synthetic.person.attachment.ATTACHMENTS`.
     """
 
@@ -52,6 +53,7 @@ class Outfit:
     hem_flare_m: float = HEM_FLARE_M
     sleeve_flare_m: float = 0.0
     attachment: str | None = None
+    hem_m: float | None = None
 
 
 _SHIRTS: tuple[tuple[Colour, Colour], ...] = (

@@ -189,7 +189,7 @@ def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Va
     """Colour plaid wool: translucent horizontal and vertical bands, and two lines above the hem."""
     hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0025) * 0.06 + noise.fractal(points, 0.08) * 0.06
     angle = np.arctan2(points[:, 2] - hips[2], points[:, 0] - hips[0])
-    above_hem = points[:, 1] - waist_and_hem_m(anatomy)[1]
+    above_hem = points[:, 1] - waist_and_hem_m(anatomy, outfit)[1]
     colours = _shaded(outfit.skirt, 1.0 + weave)
     around, down = np.mod(above_hem + 0.02, 0.11) < 0.035, np.mod(angle / (2.0 * np.pi) * 16.0, 1.0) < 0.3
     on_thin_line = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)

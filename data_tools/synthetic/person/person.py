@@ -1,7 +1,6 @@
 """Generate the built-in clothed person from the parametric body model Anny; no download is needed."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.dressing import add_clothing, surface_names
 from data_tools.synthetic.person.fingers import with_finger_width
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.person.outfit import HEM_FLARE_M, choose_outfit
+from data_tools.synthetic.person.outfit import Outfit, choose_outfit
 from data_tools.synthetic.person.painting import paint_texture
 from data_tools.synthetic.rig.labels import labels_from_names
 from data_tools.synthetic.rig.subject import Subject
@@ -33,24 +32,19 @@ _PHENOTYPES = {
 def make_person(
     seed: int,
     texture_px: int = 2048,
-    legwear: str = "trousers",
-    hem_flare_m: float = HEM_FLARE_M,
-    sleeve_flare_m: float = 0.0,
+    outfit: Outfit | None = None,
     finger_width_m: float | None = None,
     phenotypes: Mapping[str, float] | None = None,
-    attachment: str | None = None,
 ) -> tuple[Subject, Body]:
     """Return the clothed, textured person of a seed, and the body without clothes.
 
-    Equal seeds give equal arrays, whatever the number of threads.
+    Equal arguments give equal arrays, whatever the number of threads.
 
-    texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m, attachment: see `Outfit`. finger_width_m:
-    None: that of the person. phenotypes: of Anny, each in [0, 1]; others are those of the seed.
+    texture_px: side of the texture. outfit: None: that of the seed (`choose_outfit`), and so with finger_width_m.
+    phenotypes: of Anny, each in [0, 1]; others are those of the seed.
     """
     model, noise = load_anny(), ValueNoise(seed)
-    outfit = replace(
-        choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m, attachment=attachment
-    )
+    outfit = outfit or choose_outfit(seed)
     with torch_threads(1):
         bare = model.at_shape(_shape(model, seed, phenotypes or {}))
     if finger_width_m is not None:

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.anatomy import Anatomy
 from data_tools.synthetic.person.noise import ValueNoise
+from data_tools.synthetic.person.outfit import Outfit
 from data_tools.synthetic.person.surface import hull_exit_distance_m
 from pipeline.body.body import Body
 
@@ -48,16 +49,15 @@ class SkirtMesh:
 
 
 def build_skirt(
-    body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise, hem_flare_m: float
+    body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise, outfit: Outfit
 ) -> SkirtMesh:
     """Fit a skirt around a clothed person in the A-pose.
 
-    arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored. hem_flare_m: see
-    `Outfit`.
+    arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored.
     """
     waist_to_hem = np.linspace(0.0, 1.0, ROWS)
     trunk = arm_weights < _MAX_ARM_WEIGHT
-    outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise, hem_flare_m)
+    outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise, outfit)
     axis = _axis_m(outer_surface[:, 0, 1], anatomy)[:, None]
     inwards = axis - outer_surface
     inside = outer_surface + THICKNESS_M * inwards / np.linalg.norm(inwards, axis=2, keepdims=True)
@@ -72,9 +72,10 @@ def build_skirt(
     return SkirtMesh(vertices, faces, np.stack([across, height], axis=1).astype(np.float32), faces_uv, weights)
 
 
-def waist_and_hem_m(anatomy: Anatomy) -> tuple[float, float]:
-    """Return the heights of waist and hem: above the hips, and above the knees."""
-    return float(anatomy.joints_m["Hips"][1]) + 0.07, float(anatomy.joints_m["LeftLeg"][1]) + 0.05
+def waist_and_hem_m(anatomy: Anatomy, outfit: Outfit) -> tuple[float, float]:
+    """Return the heights of waist and hem: above the hips, and that of the outfit or above the knees."""
+    hem_m = float(anatomy.joints_m["LeftLeg"][1]) + 0.05 if outfit.hem_m is None else outfit.hem_m
+    return float(anatomy.joints_m["Hips"][1]) + 0.07, hem_m
 
 
 def _outer_surface_m(
@@ -82,16 +83,16 @@ def _outer_surface_m(
     waist_to_hem: Float[np.ndarray, "r"],
     anatomy: Anatomy,
     noise: ValueNoise,
-    hem_flare_m: float,
+    outfit: Outfit,
 ) -> Float[np.ndarray, "r c 3"]:
     """Return positions of the outer side; rows from waist (0) to hem (1), columns from +X towards +Z."""
-    top, hem = waist_and_hem_m(anatomy)
+    top, hem = waist_and_hem_m(anatomy, outfit)
     height = top + (hem - top) * waist_to_hem
     axis = _axis_m(height, anatomy)
     angle = 2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     outwards = np.stack([np.cos(angle), np.zeros(COLUMNS), np.sin(angle)], axis=1)
     body = np.stack([_hull_radius_m(trunk_m, middle, outwards) for middle in axis])
-    radius = np.maximum.accumulate(body) + EASE_M + hem_flare_m * waist_to_hem[:, None]
+    radius = np.maximum.accumulate(body) + EASE_M + outfit.hem_flare_m * waist_to_hem[:, None]
     ring = np.broadcast_to(outwards, (ROWS, COLUMNS, 3)) * 0.3 + np.array([0.0, 0.2, 0.0]) * waist_to_hem[:, None, None]
     pleat_phase_noise = noise(ring.reshape(-1, 3).astype(np.float32), 0.11, order=3).reshape(ROWS, COLUMNS)
     pleats = 0.5 + 0.5 * np.cos(N_PLEATS * angle + 1.2 * pleat_phase_noise)

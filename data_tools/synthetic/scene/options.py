@@ -139,6 +139,7 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("arc", 0.0, 360.0),
         ("turns", 1, 20),
         ("flare_m", 0.0, 0.6),
+        ("hem_m", 0.02, 0.7),
         ("sleeve_flare_m", 0.0, 0.15),
         ("finger_mm", 1.0, 30.0),
         ("age", 0.0, 1.0),

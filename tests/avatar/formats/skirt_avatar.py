@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_tools.synthetic.person.outfit import choose_outfit
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.person.skirt import COLUMNS, ROWS
 from data_tools.synthetic.rig.subject import Subject
@@ -31,7 +32,7 @@ SKIRT_VERTICES = 2 * ROWS * COLUMNS
 
 @lru_cache(maxsize=3)
 def _person(seed: int, legwear: str, flare_m: float) -> tuple[Subject, Body]:
-    return make_person(seed, 64, legwear, flare_m)
+    return make_person(seed, 64, replace(choose_outfit(seed, legwear), hem_flare_m=flare_m))
 
 
 def clothed(seed: int, legwear: str, flare_m: float) -> tuple[MeshArtifact, Body]:

@@ -1,5 +1,7 @@
 """An attachment is a closed surface that overlaps the person, leaves the face free, and moves with head or chest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -43,7 +45,7 @@ def test_an_attachment_is_closed_and_leaves_the_face_free(kind: str, bare: tuple
 
 
 def test_the_faces_of_a_cap_are_labelled_and_have_its_colour() -> None:
-    subject, bare = make_person(0, 128, attachment="cap")
+    subject, bare = make_person(0, 128, replace(choose_outfit(0), attachment="cap"))
     assert subject.labels is not None
     assert "cap" in subject.labels.names
     is_cap = np.array(subject.labels.names)[subject.labels.of_face] == "cap"

@@ -1,6 +1,7 @@
 """The skirt is one closed surface outside the other clothes, spans the gap between the legs and follows both legs."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,12 +58,19 @@ def test_flare_widens_the_hem_only() -> None:
     """The waist keeps its width; the mean radius of the hem grows by the difference of the flares."""
     rings = []
     for hem_flare_m in (0.07, 0.24):
-        made, _ = make_person(0, 64, "skirt", hem_flare_m)
+        made, _ = make_person(0, 64, replace(choose_outfit(0, "skirt"), hem_flare_m=hem_flare_m))
         outside = made.body.vertices[-2 * ROWS * COLUMNS : -ROWS * COLUMNS].reshape(ROWS, COLUMNS, 3)
         centre = outside.mean(axis=1, keepdims=True)
         rings.append(np.linalg.norm((outside - centre)[..., [0, 2]], axis=2).mean(axis=1))
     assert rings[1][0] == pytest.approx(rings[0][0], abs=1e-4)
     assert rings[1][-1] - rings[0][-1] == pytest.approx(0.17, abs=0.01)
+
+
+def test_a_dress_reaches_its_hem() -> None:
+    outfit = replace(choose_outfit(0, "skirt"), hem_m=0.04)
+    made, _ = make_person(0, 64, outfit)
+    rows_m = made.body.vertices[-2 * ROWS * COLUMNS : -ROWS * COLUMNS, 1].reshape(ROWS, COLUMNS)
+    np.testing.assert_allclose(rows_m[-1], 0.04, atol=1e-4)
 
 
 def test_labels_name_garments_and_body_parts(person: Subject) -> None:
@@ -83,7 +91,7 @@ def test_labels_name_garments_and_body_parts(person: Subject) -> None:
 
 def test_skirt_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarray, bare: Body) -> None:
     """A line along Z between the knees hits no leg, and both sides of the skirt twice."""
-    _, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare))
+    _, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare), choose_outfit(0, "skirt"))
     start, back = np.array([0.0007, hem + 0.0131, 2.0]), np.array([0.0, 0.0, -1.0])
     assert len(ray_triangle_distances(start, back, corners)) == 4
     assert (
@@ -98,7 +106,7 @@ def test_skirt_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarr
 
 def test_legs_and_shirt_are_inside_the_skirt(person: Subject, corners: np.ndarray, bare: Body) -> None:
     """Outward rays from the legs and the shirt hit both sides of the skirt."""
-    waist, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare))
+    waist, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare), choose_outfit(0, "skirt"))
     vertices = person.body.vertices[: -2 * ROWS * COLUMNS]
     inner = (vertices[:, 1] > hem + 0.01) & (vertices[:, 1] < waist - 0.02) & (np.abs(vertices[:, 0]) < 0.28)
     chosen = np.random.default_rng(0).choice(np.flatnonzero(inner), 80, replace=False)
