@@ -175,7 +175,7 @@ def run(
         capture, inputs, (body, motion), (mesh, skin, shader), aligned.validation
     )
     soles = LevelSoles.of(mesh, skin.weights, body, motion.select(parts[0]))
-    level = soles.turn_mesh(mesh, skin.weights, body, motion.select(parts[0]))
+    level = soles.turn_mesh(mesh, skin.weights, body)
     save_dense_mesh(out, move_along(finished.dense, finished.mesh, level))
     write_results(out, mesh, (level, soles), skin, shader, finished.is_inside)
     save_motion(out / "motion.npz", soles.turn_motion_back(final_motion, body))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
@@ -23,6 +23,7 @@ from pipeline.geometry.rotation import (
     quaternion_multiply,
     rotation_between,
 )
+from pipeline.geometry.skinning import linear_blend_skinning
 
 FEET = (("LeftFoot", "LeftToeBase"), ("RightFoot", "RightToeBase"))
 """Ankle and ball of either foot, which turn together."""
@@ -57,10 +58,7 @@ class LevelSoles:
         """
         rotations = cls().rotations
         poses = canonical_to_world(body, motion)
-        for side, names in enumerate(FEET):
-            if not set(names) <= set(body.joint_names):
-                continue
-            joints = [body.joint(name) for name in names]
+        for side, joints in _feet_of(body).items():
             sole = resting_normal(mesh.vertices[(weights[:, joints].sum(dim=1) > MIN_FOOT_WEIGHT).numpy()])
             standing = standing_normal(body, joints, poses)
             if sole is not None and standing is not None:
@@ -71,49 +69,38 @@ class LevelSoles:
     def transforms(self, body: Body) -> Float[Tensor, "j 4 4"]:
         """Return what the rotations do to points that move with each joint."""
         transforms = torch.eye(4).repeat(len(body.joint_names), 1, 1)
-        for names, rotation in zip(FEET, torch.from_numpy(self.rotations).float(), strict=True):
-            if set(names) <= set(body.joint_names):
-                joints = [body.joint(name) for name in names]
-                ankle_m = torch.from_numpy(body.joints_m[joints[0]]).float()
-                transforms[joints, :3, :3] = rotation
-                transforms[joints, :3, 3] = ankle_m - rotation @ ankle_m
+        for side, joints in _feet_of(body).items():
+            rotation = torch.from_numpy(self.rotations[side]).float()
+            ankle_m = torch.from_numpy(body.joints_m[joints[0]]).float()
+            transforms[joints, :3, :3] = rotation
+            transforms[joints, :3, 3] = ankle_m - rotation @ ankle_m
         return transforms
 
-    def turn_mesh(self, mesh: Mesh, weights: Float[Tensor, "v j"], body: Body, motion: Motion) -> Mesh:
-        """Return the mesh with level soles, which is posed as before in a typical frame of the motion.
-
-        Around the ankles blended skin differs in others by what their poses differ from that frame.
-        """
-        pose = canonical_to_world(body, motion.select(self._typical_frame(body, motion)))[0].double()
-        turned = pose @ torch.linalg.inv(self.transforms(body).double())
-        before, after = (torch.einsum("vj,jab->vab", weights.double(), joints) for joints in (pose, turned))
-        vertices = torch.from_numpy(mesh.vertices).double()
-        posed = (before[:, :3, :3] @ vertices[..., None])[..., 0] + before[:, :3, 3] - after[:, :3, 3]
-        is_turned = (weights[:, self._turned_joints(body)] > 0.0).any(dim=1)
-        vertices[is_turned] = torch.linalg.solve(after[is_turned, :3, :3], posed[is_turned])
-        return Mesh(vertices.float().numpy(), mesh.faces)
-
-    def _turned_joints(self, body: Body) -> list[int]:
-        return [body.joint(name) for names in FEET for name in names if set(names) <= set(body.joint_names)]
-
-    def _typical_frame(self, body: Body, motion: Motion) -> Int[np.ndarray, "1"]:
-        """Return the frame whose feet are turned nearest to their mean."""
-        feet_wxyz = motion.rotations_wxyz[:, self._turned_joints(body)].reshape(len(motion.frame_index), -1)
-        return np.linalg.norm(feet_wxyz - feet_wxyz.mean(axis=0), axis=1).argmin(keepdims=True)
+    def turn_mesh(self, mesh: Mesh, weights: Float[Tensor, "v j"], body: Body) -> Mesh:
+        """Return the mesh with level soles."""
+        vertices = torch.from_numpy(mesh.vertices).float()
+        turned = linear_blend_skinning(vertices, weights.float(), self.transforms(body)[None])[0]
+        return Mesh(turned.numpy(), mesh.faces)
 
     def turn_motion_back(self, motion: Motion, body: Body) -> Motion:
         """Return the motion that poses the mesh with level soles as this one posed the extracted mesh."""
         rotations_wxyz = torch.from_numpy(motion.rotations_wxyz).double()
-        for names, rotation in zip(FEET, torch.from_numpy(self.rotations), strict=True):
-            if not set(names) <= set(body.joint_names):
-                continue
-            ankle, ball = (body.joint(name) for name in names)
-            turned_wxyz = matrix_to_quaternion(rotation).expand(len(rotations_wxyz), 4)
+        for side, (ankle, ball) in _feet_of(body).items():
+            turned_wxyz = matrix_to_quaternion(torch.from_numpy(self.rotations[side])).expand(len(rotations_wxyz), 4)
             back_wxyz = quaternion_conjugate(turned_wxyz)
             rotations_wxyz[:, ankle] = quaternion_multiply(rotations_wxyz[:, ankle], back_wxyz)
             ball_wxyz = quaternion_multiply(rotations_wxyz[:, ball], back_wxyz)
             rotations_wxyz[:, ball] = quaternion_multiply(turned_wxyz, ball_wxyz)
         return motion.with_pose(rotations_wxyz.numpy(), motion.root_translation_m)
+
+
+def _feet_of(body: Body) -> dict[int, list[int]]:
+    """Return the joints of the feet that a body has: ankle and ball by side, 0 or 1."""
+    return {
+        side: [body.joint(name) for name in names]
+        for side, names in enumerate(FEET)
+        if set(names) <= set(body.joint_names)
+    }
 
 
 def standing_normal(body: Body, joints: list[int], poses: Float[Tensor, "n j 4 4"]) -> Float[np.ndarray, "3"] | None:

@@ -37,9 +37,7 @@ def sole_tilt_deg(mesh: Mesh, body: Body, side: int) -> float:
 def tilted(body: Body) -> Mesh:
     """The body with feet that were turned about their ankles."""
     tilts = LevelSoles(axis_angle_to_matrix(torch.tensor(TILTS_RAD).double()).numpy())
-    return tilts.turn_mesh(
-        body.mesh(), torch.from_numpy(body.skin_weights), body, motion_of_feet(body, np.zeros((2, 3)))
-    )
+    return tilts.turn_mesh(body.mesh(), torch.from_numpy(body.skin_weights), body)
 
 
 def swaying(body: Body) -> Motion:
@@ -72,7 +70,7 @@ def test_a_box_rests_on_its_lower_face() -> None:
 def test_tilted_feet_are_laid_level_and_posed_as_before(body: Body) -> None:
     mesh, weights, motion = tilted(body), torch.from_numpy(body.skin_weights), swaying(body)
     soles = LevelSoles.of(mesh, weights, body, motion_of_feet(body, -np.array(TILTS_RAD)))
-    level, turned = soles.turn_mesh(mesh, weights, body, motion), soles.turn_motion_back(motion, body)
+    level, turned = soles.turn_mesh(mesh, weights, body), soles.turn_motion_back(motion, body)
     before, after = (canonical_to_world(body, poses) for poses in (motion, turned))
     posed = [
         linear_blend_skinning(torch.from_numpy(surface.vertices).float(), weights, poses)
@@ -83,7 +81,6 @@ def test_tilted_feet_are_laid_level_and_posed_as_before(body: Body) -> None:
         assert sole_tilt_deg(level, body, side) < 0.5
         of_foot = (weights[:, [body.joint(name) for name in names]].sum(dim=1) > 0.999).numpy()
         np.testing.assert_allclose(posed[1][:, of_foot], posed[0][:, of_foot], atol=0.002)
-    assert float((posed[1] - posed[0]).norm(dim=-1).amax(dim=1).min()) < 0.001
     far = np.abs(body.vertices[:, 1]) > 0.3
     np.testing.assert_allclose(level.vertices[far], mesh.vertices[far], atol=1e-6)
     np.testing.assert_allclose(posed[1][:, far], posed[0][:, far], atol=1e-5)
