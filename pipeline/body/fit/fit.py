@@ -238,7 +238,7 @@ def _fit_shared(
             posture = objective.estimate_posture(context.pose_prior, state)
         has_converged = shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO
         if evidence is not None:
-            turn = gravity.upright_turn(model, state, evidence.about(to_vertical[:, 1]), settings)
+            turn = gravity.upright_turn(model, state, evidence.about(to_vertical[:, 1]), settings, observations.camera)
             state = gravity.turn_state(state, turn, torch.zeros(3, dtype=torch.float64))
             observations = gravity.turn_world(observations, turn)
             to_vertical = turn @ to_vertical

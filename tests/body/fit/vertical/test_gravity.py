@@ -15,6 +15,7 @@ from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.vertical.gravity import (
+    LEAN_BIAS_RAD,
     LEAN_GAIN_TOWARDS,
     MAX_TURN_RAD,
     TiltEvidence,
@@ -163,10 +164,13 @@ def test_the_world_is_turned_by_the_mean_lean_of_a_turn() -> None:
     """Hardly anything is known of the vertical but the bodies, and then the axis of the turn as well."""
     scene = standing(2 * np.pi)
 
-    def turn(state: FitState, axis_std_rad: float = np.pi) -> torch.Tensor:
+    looks_down = turn_camera(scene.camera, rotation_deg(10.0, 0.0, 0.0).T, STILL)
+    assert camera_tilt_deg(looks_down)[0] == pytest.approx(-10.0, abs=1e-4)
+
+    def turn(state: FitState, axis_std_rad: float = np.pi, camera: Camera = looks_down) -> torch.Tensor:
         """Return where +Y of the old world points, to the right and towards the camera, degrees."""
         axis = TiltEvidence.from_std(STILL[:2], torch.full_like(STILL[:2], axis_std_rad))
-        return torch.rad2deg(upright_turn(scene.model, state, axis, SETTINGS)[[0, 2], 1])
+        return torch.rad2deg(upright_turn(scene.model, state, axis, SETTINGS, camera)[[0, 2], 1])
 
     trunk = turn(scene.state)  # that of the A-pose leans a little in the body's frame
     assert trunk.abs().max() < 0.6
@@ -177,6 +181,10 @@ def test_the_world_is_turned_by_the_mean_lean_of_a_turn() -> None:
     assert float(halved[1] / turn(slightly)[1]) == pytest.approx(0.5, abs=0.05)
     fallen = turn(turn_state(scene.state, rotation_deg(20.0, 0.0, 0.0), STILL))
     assert float(fallen[1]) == pytest.approx(-np.degrees(MAX_TURN_RAD), abs=0.1)
+    for pitch_deg, bias_deg in ((0.0, np.degrees(LEAN_BIAS_RAD)), (10.0, np.degrees(LEAN_BIAS_RAD) + 1.5)):
+        camera = turn_camera(scene.camera, rotation_deg(-pitch_deg, 0.0, 0.0).T, STILL)
+        towards_deg = turn(scene.state, camera=camera)[1] - trunk[1]
+        assert float(towards_deg) == pytest.approx(bias_deg, abs=0.05)
     assert turn(turn_state(standing(0.3).state, rotation_deg(5.0, 0.0, 0.0), STILL)).tolist() == [0.0, 0.0]
 
 
