@@ -214,8 +214,9 @@ def leg_profile(
     thigh_m = body.height_on_legs_m(0.0) - body.height_on_legs_m(1.0)
     hangs = (gap_px >= 1.0) & (open_px < MIN_OPEN_SHARE * gap_px)
     floor_hem = LOWEST + HEIGHT_STEP * (int(np.argmin(np.append(hangs[len(HEIGHTS) :], False))) + 0.5)
-    k = len(HEIGHTS)
-    return LegProfile(medians[0, :k], gap_px[:k], open_px[:k], medians[1, :k], medians[2, :k], thigh_m, floor_hem)
+    end = len(HEIGHTS)
+    margin_m, half_width_m, slope = medians[:, :end]
+    return LegProfile(margin_m, gap_px[:end], open_px[:end], half_width_m, slope, thigh_m, floor_hem)
 
 
 def _profile_of_frame(
