@@ -20,7 +20,7 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.creases import find_creases
 from pipeline.geometry.texture_rendering import sample_texture
-from pipeline.mesh.files import load_mesh
+from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.mesh.soles import LevelSoles
 from pipeline.texture.files import TextureArtifact, load_texture
 from pipeline.texture.light import VertexGloss
@@ -61,24 +61,28 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
     """
     body = load_body(inputs["body"] / "body.npz")
     camera = load_camera(inputs["body"] / "camera.npz")
-    motion, soles = load_motion(inputs["mesh"] / "motion.npz"), load_mesh(inputs["mesh"]).soles
-    fitted = soles.turn_motion_back(load_motion(inputs["body"] / "motion.npz"), body)
+    mesh, motion = load_mesh(inputs["mesh"]), load_motion(inputs["mesh"] / "motion.npz")
+    fitted = mesh.soles.turn_motion_back(load_motion(inputs["body"] / "motion.npz"), body)
     return FinishedRun(
         capture=load_capture(inputs["frames"]),
         camera=camera,
         body=body,
         motion=motion,
-        avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
-        field_renderer=_make_field_renderer(inputs["field"], soles, body, camera),
+        avatar=add_texture(mesh, load_texture(inputs["texture"])),
+        field_renderer=_make_field_renderer(inputs["field"], mesh.soles, body, camera),
         refined_canonical_to_world=canonical_to_world(body, motion),
         fitted_canonical_to_world=canonical_to_world(body, fitted),
     )
 
 
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
-    """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
-    texture = load_texture(texture_dir)
-    whole = load_mesh(mesh_dir).cut(texture.cut)
+    """Read the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
+    return add_texture(load_mesh(mesh_dir), load_texture(texture_dir))
+
+
+def add_texture(mesh: MeshArtifact, texture: TextureArtifact) -> TexturedAvatar:
+    """Combine a skinned mesh with its atlas and maps."""
+    whole = mesh.cut(texture.cut)
     creases = find_creases(whole.mesh)
     skinned, atlas = whole.split(creases), creases.split_atlas(texture.atlas)
     return TexturedAvatar(
@@ -117,7 +121,6 @@ def _make_field_renderer(field_dir: Path, soles: LevelSoles, body: Body, camera:
     field = load_field(field_dir / "field.safetensors")
     occupancy = load_occupancy(field_dir / "occupancy.npz")
     skin = build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
-
     to_mesh = soles.transforms(body)
 
     def render_pose(canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:

@@ -128,7 +128,7 @@ class LegProfile:
         """Return where a skirt or coat ends in the pictures, in the unit of `HEIGHTS`; None without one.
 
         There the margin falls to half, or the background begins to be seen between the legs. Cloth down to the floor
-        ends at the lowest of the heights.
+        ends at `floor_hem`.
         """
         if not self.cloth_hangs_between_legs():
             return None

@@ -6,16 +6,15 @@ chest below the shoulders.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import xatlas
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from skimage.measure import marching_cubes
 
 from data_tools.synthetic.person.anatomy import Anatomy
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.person.surface import neighbour_averaging_matrix, smooth_laplacian
+from data_tools.synthetic.person.surface import WornSurface, neighbour_averaging_matrix, smooth_laplacian
 from pipeline.body.body import Body
 
 CELL_M = 0.009
@@ -33,18 +32,7 @@ _HANGING_M = 0.02
 _Distance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
 
 
-@dataclass(frozen=True)
-class AttachmentMesh:
-    """A closed surface with UV; rows of `faces_uv` correspond to rows of `faces`."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    uv: Float[np.ndarray, "t 2"]
-    faces_uv: Int[np.ndarray, "f 3"]
-    skin_weights: Float[np.ndarray, "v j"]
-
-
-def build_attachment(kind: str, body: Body, anatomy: Anatomy, noise: ValueNoise) -> AttachmentMesh:
+def build_attachment(kind: str, body: Body, anatomy: Anatomy, noise: ValueNoise) -> WornSurface:
     """Put one of `ATTACHMENTS` on a clothed person in the A-pose."""
     middle_m = anatomy.skull_m().astype(np.float64)
     scale = (anatomy.crown_y_m - middle_m[1]) / _SKULL_HEIGHT_M
@@ -62,7 +50,7 @@ def build_attachment(kind: str, body: Body, anatomy: Anatomy, noise: ValueNoise)
     uv = _ATLAS_MARGIN + (1.0 - 2.0 * _ATLAS_MARGIN) * uv
     uv[:, 1] = 1.0 - ATLAS_HEIGHT_FRACTION * (1.0 - uv[:, 1])
     weights = _skin_weights(vertices, body, anatomy)
-    return AttachmentMesh(vertices, faces.astype(np.int32), uv.astype(np.float32), faces_uv.astype(np.int32), weights)
+    return WornSurface(vertices, faces.astype(np.int32), uv.astype(np.float32), faces_uv.astype(np.int32), weights)
 
 
 def _skin_weights(vertices: Float[np.ndarray, "v 3"], body: Body, anatomy: Anatomy) -> Float[np.ndarray, "v j"]:

@@ -15,12 +15,13 @@ from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.anatomy import ATTACHMENT, SKIN, SKIRT, Anatomy, compute_arm_head_weights, label_faces
 from data_tools.synthetic.person.attachment import ATLAS_HEIGHT_FRACTION as ATTACHMENT_FRACTION
-from data_tools.synthetic.person.attachment import HAIRSTYLES, AttachmentMesh, build_attachment
+from data_tools.synthetic.person.attachment import HAIRSTYLES, build_attachment
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m, sleeve_flare_offset_m
 from data_tools.synthetic.person.skirt import ATLAS_HEIGHT_FRACTION as SKIRT_FRACTION
-from data_tools.synthetic.person.skirt import SkirtMesh, build_skirt
+from data_tools.synthetic.person.skirt import build_skirt
 from data_tools.synthetic.person.surface import (
+    WornSurface,
     append_midpoint_values,
     hull_exit_distance_m,
     neighbour_averaging_matrix,
@@ -87,7 +88,7 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
     clothed = ClothedSurface(
         clothed_body, append_midpoint_values(model.uv, uv_pairs), faces_uv, drape, arm_head_weights, labels
     )
-    added: list[tuple[SkirtMesh | AttachmentMesh, int, float]] = []
+    added: list[tuple[WornSurface, int, float]] = []
     if outfit.legwear == "skirt":
         skirt = build_skirt(clothed_body, arm_head_weights[:, 0], anatomy, noise, outfit)
         added.append((skirt, SKIRT, SKIRT_FRACTION))
@@ -110,9 +111,7 @@ def surface_names(person: ClothedSurface, anatomy: Anatomy, outfit: Outfit) -> S
     return names
 
 
-def _add_surface(
-    person: ClothedSurface, mesh: SkirtMesh | AttachmentMesh, label: int, atlas_fraction: float
-) -> ClothedSurface:
+def _add_surface(person: ClothedSurface, mesh: WornSurface, label: int, atlas_fraction: float) -> ClothedSurface:
     """Add a separate surface; the UV charts of others are scaled down to free the top of the atlas."""
     worn, start, start_uv = person.body, len(person.body.vertices), len(person.uv)
     body = replace(

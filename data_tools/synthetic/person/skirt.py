@@ -6,7 +6,6 @@ between the legs and falls straight from the widest height.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +14,7 @@ from scipy.spatial import ConvexHull
 from data_tools.synthetic.person.anatomy import Anatomy
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import Outfit
-from data_tools.synthetic.person.surface import hull_exit_distance_m
+from data_tools.synthetic.person.surface import WornSurface, hull_exit_distance_m
 from pipeline.body.body import Body
 
 ROWS, COLUMNS = 40, 192
@@ -37,20 +36,9 @@ _WEIGHT_SIGMA_M = (0.02, 0.06)
 """Standard deviation of the Gaussian that averages the skin weights of the body, at waist and hem."""
 
 
-@dataclass(frozen=True)
-class SkirtMesh:
-    """A closed surface with UV; rows of `faces_uv` correspond to rows of `faces`."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    uv: Float[np.ndarray, "t 2"]
-    faces_uv: Int[np.ndarray, "f 3"]
-    skin_weights: Float[np.ndarray, "v j"]
-
-
 def build_skirt(
     body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise, outfit: Outfit
-) -> SkirtMesh:
+) -> WornSurface:
     """Fit a skirt around a clothed person in the A-pose.
 
     arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored.
@@ -69,7 +57,7 @@ def build_skirt(
     height = 1.0 - _ATLAS_MARGIN - (ATLAS_HEIGHT_FRACTION - 2.0 * _ATLAS_MARGIN) * profile / (2 * ROWS)
     faces_uv = _quads(2 * ROWS, COLUMNS, lambda row, col: row * (COLUMNS + 1) + col)
     faces = _quads(2 * ROWS, COLUMNS, lambda row, col: row % (2 * ROWS) * COLUMNS + col % COLUMNS)
-    return SkirtMesh(vertices, faces, np.stack([across, height], axis=1).astype(np.float32), faces_uv, weights)
+    return WornSurface(vertices, faces, np.stack([across, height], axis=1).astype(np.float32), faces_uv, weights)
 
 
 def waist_and_hem_m(anatomy: Anatomy, outfit: Outfit) -> tuple[float, float]:

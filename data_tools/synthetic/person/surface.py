@@ -1,11 +1,24 @@
 """Mesh operations of the clothing model: midpoint subdivision, smoothing, connected components, convex hulls."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 _PARALLEL_EPS = 1e-9
 """Rays with a smaller cosine to the plane normal are treated as parallel to the plane."""
+
+
+@dataclass(frozen=True)
+class WornSurface:
+    """A closed surface with UV that is worn over the body; rows of `faces_uv` correspond to rows of `faces`."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    uv: Float[np.ndarray, "t 2"]
+    faces_uv: Int[np.ndarray, "f 3"]
+    skin_weights: Float[np.ndarray, "v j"]
 
 
 def subdivide_at_midpoints(
