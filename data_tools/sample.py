@@ -41,6 +41,11 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--hem-m", type=float, help="height of the hem of the skirt, metres; above the knees if absent")
     parser.add_argument("--sleeve-flare-m", type=float, default=0.0, help="widening of the sleeves to the hem, metres")
+    parser.add_argument(
+        "--trouser-flare-m", type=float, default=0.0, help="widening of the trousers to the hem, metres"
+    )
+    parser.add_argument("--jacket-m", type=float, default=0.0, help="thickness of a padded jacket, metres; 0: a shirt")
+    parser.add_argument("--heel-m", type=float, default=0.0, help="height of the heels, metres")
     parser.add_argument("--finger-mm", type=float, help="width of the fingers, mm; that of the person if absent")
     parser.add_argument("--attachment", choices=sorted(ATTACHMENTS), help="what stands off the person")
     for name in PHENOTYPES:
@@ -57,6 +62,9 @@ def main(argv: Sequence[str]) -> None:
         hem_flare_m=HEM_FLARE_M if options.flare_m is None else options.flare_m,
         hem_m=options.hem_m,
         sleeve_flare_m=options.sleeve_flare_m,
+        trouser_flare_m=options.trouser_flare_m,
+        jacket_m=options.jacket_m,
+        heel_m=options.heel_m,
         attachment=options.attachment,
     )
     subject, bare = make_person(options.seed, options.texture, outfit, finger_m, phenotypes)

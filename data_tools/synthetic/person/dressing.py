@@ -17,7 +17,14 @@ from data_tools.synthetic.person.anatomy import ATTACHMENT, SKIN, SKIRT, Anatomy
 from data_tools.synthetic.person.attachment import ATLAS_HEIGHT_FRACTION as ATTACHMENT_FRACTION
 from data_tools.synthetic.person.attachment import HAIRSTYLES, build_attachment
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m, sleeve_flare_offset_m
+from data_tools.synthetic.person.outfit import (
+    LAYERS,
+    Outfit,
+    compute_layer_depths_m,
+    jacket_offset_m,
+    sleeve_flare_offset_m,
+    trouser_flare_offset_m,
+)
 from data_tools.synthetic.person.skirt import ATLAS_HEIGHT_FRACTION as SKIRT_FRACTION
 from data_tools.synthetic.person.skirt import build_skirt
 from data_tools.synthetic.person.surface import (
@@ -40,6 +47,12 @@ TOE_BOX_HEIGHT_M = 0.075
 
 SHOE_THICKNESS_M = 0.008
 """Thickness of the shoes' upper."""
+
+TOES_TO_AXIS_M = 0.03
+"""From the joint of the toes back to the end of the axis of a foot."""
+
+HEEL_CORNERS_M = np.array([[x, 0.0, z] for x in (-0.02, 0.02) for z in (0.01, 0.04)])
+"""Of a raised heel on the floor, from its back."""
 
 _HULL_ITERATIONS = 10
 _SMOOTHING_ITERATIONS = {"shoes": 2, "trousers": 24, "shirt": 40, "hair": 6}
@@ -73,14 +86,18 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
     skin_vertices = np.zeros(len(bare), dtype=bool)
     skin_vertices[faces[labels == SKIN]] = True
     mean = neighbour_averaging_matrix(faces, len(bare))
-    base_surface = _add_toe_boxes(bare, mean, skin_vertices, anatomy)
+    base_surface = _add_toe_boxes(bare, mean, skin_vertices, anatomy, outfit.heel_m)
     vertices = drape = base_surface
     for _ in range(2):
         drape = vertices
         depths = np.where(
             skin_vertices[:, None], compute_layer_depths_m(drape, arm_head_weights, anatomy, outfit), -1.0
         )
-        flare_m = sleeve_flare_offset_m(drape, arm_head_weights, anatomy, outfit)
+        flare_m = {
+            "shirt": sleeve_flare_offset_m(drape, arm_head_weights, anatomy, outfit)
+            + jacket_offset_m(drape, depths[:, LAYERS.index("shirt")], outfit),
+            "trousers": trouser_flare_offset_m(drape, anatomy, outfit),
+        }
         vertices = _add_layers(base_surface, faces, mean, depths, flare_m, anatomy, noise)
     clothed_body = replace(
         body, vertices=vertices, faces=faces, skin_weights=append_midpoint_values(body.skin_weights, pairs)
@@ -135,18 +152,18 @@ def _add_layers(
     faces: Int[np.ndarray, "f 3"],
     mean: sparse.csr_matrix,
     depths_m: Float[np.ndarray, "v 4"],
-    sleeve_flare_m: Float[np.ndarray, "v"],
+    additional_m: dict[str, Float[np.ndarray, "v"]],
     anatomy: Anatomy,
     noise: ValueNoise,
 ) -> Float[np.ndarray, "v 3"]:
-    """Displace the surface by all layers in order. sleeve_flare_m: additional thickness of the shirt."""
+    """Displace the surface by all layers in order. additional_m: additional thickness of layers."""
     vertices = skin_m
     for column, layer in enumerate(LAYERS):
         smooth = smooth_laplacian(vertices, mean, _SMOOTHING_ITERATIONS[layer])
         normals = Mesh(smooth, faces).vertex_normals()
         thickness = _THICKNESS[layer](skin_m, depths_m[:, column], anatomy, noise)
-        if layer == "shirt":
-            thickness = thickness + sleeve_flare_m
+        if layer in additional_m:
+            thickness = thickness + additional_m[layer]
         layer_weight = np.clip(depths_m[:, column] / HEM_TRANSITION_M + 0.5, 0.0, 1.0)[:, None]
         vertices = vertices + layer_weight * (smooth + thickness[:, None] * normals - vertices)
         if layer == "shoes":
@@ -155,32 +172,50 @@ def _add_layers(
 
 
 def _add_toe_boxes(
-    bare_m: Float[np.ndarray, "v 3"], mean: sparse.csr_matrix, skin_vertices: np.ndarray, anatomy: Anatomy
+    bare_m: Float[np.ndarray, "v 3"],
+    mean: sparse.csr_matrix,
+    skin_vertices: np.ndarray,
+    anatomy: Anatomy,
+    heel_m: float,
 ) -> Float[np.ndarray, "v 3"]:
     """Project the lower part of each foot onto its convex hull, which closes the gaps between the toes.
 
-    Alternating smoothing and projection distributes the sides of the toes over the hull instead of folding them.
+    Alternating smoothing and projection distributes the sides of the toes over the hull instead of folding them. The
+    hull of a foot with a raised heel goes down to the floor below the heel.
     """
     vertices = bare_m
     for side in ("Left", "Right"):
         ankle, toes = anatomy.joints_m[f"{side}Foot"], anatomy.joints_m[f"{side}ToeBase"]
-        on_foot = skin_vertices & (np.abs(bare_m[:, 0] - ankle[0]) < 0.15) & (bare_m[:, 1] < TOE_BOX_HEIGHT_M)
-        hull = ConvexHull(bare_m[on_foot]).equations
+        near = skin_vertices & (np.abs(bare_m[:, 0] - ankle[0]) < 0.15)
+        heel_z = bare_m[near & (bare_m[:, 1] < ankle[1]), 2].min()
+        rise_m = heel_m * np.clip((toes[2] - bare_m[:, 2]) / (toes[2] - heel_z), 0.0, 1.0)
+        on_foot = near & (bare_m[:, 1] < TOE_BOX_HEIGHT_M + rise_m)
+        hull_points = bare_m[on_foot]
+        if heel_m:
+            hull_points = np.concatenate([hull_points, [ankle[0], 0.0, heel_z] + HEEL_CORNERS_M])
+        hull, axis = ConvexHull(hull_points).equations, _foot_axis(ankle, toes, heel_m)
         for _ in range(_HULL_ITERATIONS):
             vertices = np.where(on_foot[:, None], smooth_laplacian(vertices, mean, 4), vertices)
-            vertices[on_foot] = _project_onto_hull(vertices[on_foot], hull, toes)
+            vertices[on_foot] = _project_onto_hull(vertices[on_foot], hull, axis)
     return vertices
 
 
+def _foot_axis(ankle: Float[np.ndarray, "3"], toes: Float[np.ndarray, "3"], heel_m: float) -> Float[np.ndarray, "2 3"]:
+    """Return the ends of a segment inside the foot, above the arch: below the ankle, and before the toes."""
+    below_ankle = [ankle[0], heel_m + 0.5 * (ankle[1] - heel_m), ankle[2]]
+    return np.array([below_ankle, toes - [0.0, 0.0, TOES_TO_AXIS_M]])
+
+
 def _project_onto_hull(
-    points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 4"], toes: Float[np.ndarray, "3"]
+    points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 4"], axis: Float[np.ndarray, "2 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Intersect rays from the axis of the foot through the points with the hull, offset by `SHOE_THICKNESS_M`."""
-    ahead = np.minimum(points[:, 2], toes[2] - 0.03)
-    axis = np.stack([np.full(len(points), toes[0]), np.full(len(points), 0.012), ahead], axis=1)
-    outwards = points - axis
+    start, step = axis[0], axis[1] - axis[0]
+    along = np.clip((points[:, 2] - start[2]) / step[2], 0.0, 1.0)
+    origin = start + along[:, None] * step
+    outwards = points - origin
     outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
-    return (axis + hull_exit_distance_m(axis, outwards, hull, SHOE_THICKNESS_M)[:, None] * outwards).astype(
+    return (origin + hull_exit_distance_m(origin, outwards, hull, SHOE_THICKNESS_M)[:, None] * outwards).astype(
         points.dtype
     )
 

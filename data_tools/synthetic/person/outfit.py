@@ -16,6 +16,14 @@ LEGWEAR = ("trousers", "skirt")
 TUCKED_SHIRT_BELOW_HIPS_M = -0.03
 """`Outfit.shirt_below_hips_m` of a shirt that is tucked into a skirt."""
 
+JACKET_SLEEVE_FRACTION = 0.96
+"""Length of the sleeves of a jacket relative to the arm without the hand."""
+
+JACKET_SEAM_SPACING_M, JACKET_BORDER_M = 0.09, 0.05
+"""Heights between two seams, and distance from the borders within which the padding grows."""
+
+CROTCH_BELOW_HIPS_M = 0.08
+
 HEM_FLARE_M = 0.07
 """Default of `Outfit.hem_flare_m`."""
 
@@ -33,6 +41,9 @@ class Outfit:
         plaid: second colour of the skirt.
         hem_flare_m: additional radius of the skirt at the hem, compared with cloth that falls straight.
         sleeve_flare_m: additional radius of the sleeves at their hem.
+        trouser_flare_m: additional radius of the trousers at their hem.
+        jacket_m: additional thickness of a padded jacket, whose sleeves reach the wrists; 0: a shirt.
+        heel_m: height of the heels of the feet above the floor in shoes.
         hem_m: height of the hem of the skirt above the floor; None: above the knees.
         attachment: one of `data_tools.synthetic.person.attachment.ATTACHMENTS`.
     """
@@ -52,6 +63,9 @@ class Outfit:
     print_text: str
     hem_flare_m: float = HEM_FLARE_M
     sleeve_flare_m: float = 0.0
+    trouser_flare_m: float = 0.0
+    jacket_m: float = 0.0
+    heel_m: float = 0.0
     attachment: str | None = None
     hem_m: float | None = None
 
@@ -129,15 +143,15 @@ def neckline_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Fl
 
 
 def _sleeve_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
-    """Return the distance along the upper arm to the hem of the sleeve."""
+    """Return the distance along the upper arm, or the arm, to the hem of the sleeve."""
     joints = anatomy.joints_m
     depth = np.empty(len(points_m))
     is_left = points_m[:, 0] > joints["Hips"][0]
     for side, rows in (("Left", is_left), ("Right", ~is_left)):
-        shoulder, elbow = joints[f"{side}Arm"], joints[f"{side}ForeArm"]
-        length = np.linalg.norm(elbow - shoulder)
-        along = _dot(points_m[rows] - shoulder, elbow - shoulder) / length
-        depth[rows] = outfit.sleeve_fraction * length - along
+        shoulder, end = joints[f"{side}Arm"], joints[f"{side}Hand" if outfit.jacket_m else f"{side}ForeArm"]
+        length = np.linalg.norm(end - shoulder)
+        along = _dot(points_m[rows] - shoulder, end - shoulder) / length
+        depth[rows] = (JACKET_SLEEVE_FRACTION if outfit.jacket_m else outfit.sleeve_fraction) * length - along
     return depth
 
 
@@ -151,6 +165,25 @@ def sleeve_flare_offset_m(
     upper_arm_m = np.linalg.norm(anatomy.joints_m["LeftForeArm"] - anatomy.joints_m["LeftArm"])
     to_hem = 1.0 - _sleeve_depth_m(points_m, anatomy, outfit) / (outfit.sleeve_fraction * upper_arm_m)
     return outfit.sleeve_flare_m * np.where(arm_head_weights[:, 0] > 0.5, np.clip(to_hem, 0.0, 1.0), 0.0)
+
+
+def jacket_offset_m(
+    points_m: Float[np.ndarray, "n 3"], depth_m: Float[np.ndarray, "n"], outfit: Outfit
+) -> Float[np.ndarray, "n"]:
+    """Return the additional thickness of a padded jacket: three quarters at its seams, none at its borders.
+
+    depth_m: of the shirt, from `compute_layer_depths_m`.
+    """
+    bulge = np.abs(np.sin(np.pi * points_m[:, 1] / JACKET_SEAM_SPACING_M)) ** 0.5
+    return outfit.jacket_m * np.clip(depth_m / JACKET_BORDER_M, 0.0, 1.0) * (0.75 + 0.25 * bulge)
+
+
+def trouser_flare_offset_m(
+    points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit
+) -> Float[np.ndarray, "n"]:
+    """Return the additional thickness of the trousers: from 0 at the crotch to `Outfit.trouser_flare_m` at the hem."""
+    crotch, foot = anatomy.joints_m["Hips"][1] - CROTCH_BELOW_HIPS_M, anatomy.joints_m["LeftFoot"][1]
+    return outfit.trouser_flare_m * np.clip((crotch - points_m[:, 1]) / (crotch - foot), 0.0, 1.0)
 
 
 def _hair_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:

@@ -9,6 +9,7 @@ from torch import Tensor
 from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.dressing import add_clothing, surface_names
 from data_tools.synthetic.person.fingers import with_finger_width
+from data_tools.synthetic.person.heels import with_raised_heels
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import Outfit, choose_outfit
 from data_tools.synthetic.person.painting import paint_texture
@@ -49,6 +50,8 @@ def make_person(
         bare = model.at_shape(_shape(model, seed, phenotypes or {}))
     if finger_width_m is not None:
         bare = with_finger_width(bare, finger_width_m)
+    if outfit.heel_m:
+        bare = with_raised_heels(bare, outfit.heel_m)
     anatomy = measure_anatomy(model, bare)
     clothed = add_clothing(model, bare, anatomy, outfit, noise)
     texture = to_uint8(paint_texture(clothed, anatomy, outfit, noise, texture_px))

@@ -20,6 +20,7 @@ from data_tools.synthetic.rig.subject import Subject, save_subject
 from data_tools.synthetic.scene.backdrop import Room, contact_shadow
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.hand_held import hand_held_angles_rad, turn_picture
+from data_tools.synthetic.scene.lens import distort_picture
 from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
 from data_tools.synthetic.scene.walk_around import Surroundings, turned_light, walking_shift_m
@@ -30,7 +31,7 @@ from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
 
-CAPTURE_VERSION = 3
+CAPTURE_VERSION = 4
 """Increased whenever equal options give other images or the format of `truth/` changes; the Makefile reads it."""
 
 _FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
@@ -47,6 +48,8 @@ class SyntheticCapture:
             camera that stands still, in the median orientation.
         surroundings: the room if the camera is carried around the person (`motion` has the shifts of its walk): `room`
             is then that of the first frame. None: the camera stays in its place.
+        distortion: first radial coefficient of the lens (`distort_picture`). The ground truth, masks included, is that
+            of a lens without distortion.
     """
 
     subject: Subject
@@ -60,6 +63,7 @@ class SyntheticCapture:
     ball: Ball | None = None
     hand_held_deg: float = 0.0
     surroundings: Surroundings | None = None
+    distortion: float = 0.0
 
     @cached_property
     def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
@@ -100,10 +104,10 @@ class SyntheticCapture:
         return to_uint8(image), to_uint8(coverage)
 
     def as_filmed(self, image: UInt8[np.ndarray, "h w *c"], frame_index: int) -> UInt8[np.ndarray, "h w *c"]:
-        """Return an image or mask of the camera that stands still as the camera in the hand takes it."""
-        if not self.hand_held_deg:
-            return image
-        return turn_picture(image, self.camera.fx, self._camera_angles_rad[frame_index])
+        """Return an image or mask of a camera that stands still as lens and hand of the real one take it."""
+        if self.hand_held_deg:
+            image = turn_picture(image, self.camera.fx, self._camera_angles_rad[frame_index])
+        return distort_picture(image, self.camera, self.distortion) if self.distortion else image
 
     @cached_property
     def _camera_angles_rad(self) -> Float[np.ndarray, "n 3"]:
@@ -245,6 +249,7 @@ def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None
         "light": asdict(capture.light),
         "ball": capture.ball is not None,
         "hand_held_deg": capture.hand_held_deg,
+        "distortion": capture.distortion,
     }
     (truth / "capture_settings.json").write_text(json.dumps({**settings, **metadata}, indent=2, sort_keys=True) + "\n")
 

@@ -65,6 +65,9 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         help="angle by which a camera in the hand turns to both sides, degrees",
     )
     parser.add_argument(
+        "--distortion", type=float, default=0.0, help="k1 of the lens (Brown); negative: straight lines bulge outwards"
+    )
+    parser.add_argument(
         "--walk-around", action="store_true", help="the person stands still and the camera is carried around"
     )
     parser.add_argument(
@@ -141,6 +144,10 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("flare_m", 0.0, 0.6),
         ("hem_m", 0.02, 0.7),
         ("sleeve_flare_m", 0.0, 0.15),
+        ("trouser_flare_m", 0.0, 0.15),
+        ("jacket_m", 0.0, 0.08),
+        ("heel_m", 0.0, 0.12),
+        ("distortion", -0.5, 0.5),
         ("finger_mm", 1.0, 30.0),
         ("age", 0.0, 1.0),
         ("weight", 0.0, 1.0),
@@ -248,6 +255,7 @@ def build_capture(
         make_surroundings(camera, ground_m, options.background == "busy", ValueNoise(options.seed))
         if options.walk_around
         else None,
+        options.distortion,
     )
     # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)

@@ -134,3 +134,37 @@ def test_wide_sleeves_widen_to_their_hem_alone() -> None:
     assert moved_m[hem].mean() == pytest.approx(0.045, abs=0.01)
     assert moved_m[on_arm & (along > 0.8)].max() < 0.002
     assert moved_m[narrow.vertices[:, 1] < joints["Hips"][1]].max() < 0.002
+
+
+@pytest.mark.parametrize(("seed", "heel_m"), [(0, 0.0), (205, 0.0), (1, 0.08)])
+def test_shoes_are_closed_below(seed: int, heel_m: float) -> None:
+    subject, bare = make_person(seed, 64, replace(choose_outfit(seed), heel_m=heel_m))
+    mesh, labels = subject.body.mesh(), subject.labels
+    assert labels is not None
+    corners = mesh.vertices[mesh.faces]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    faces_down = (labels.of_face == labels.names.index("shoes")) & (mesh.face_normals()[:, 1] < -0.8)
+    above_sole = corners[..., 1].mean(axis=1) > mesh.vertices[:, 1].min() + 0.01
+    assert area[faces_down].sum() > 0.015  # both soles, square metres
+    assert area[faces_down & above_sole].sum() < 0.15 * area[faces_down].sum()  # rims
+    ankle = bare.joints_m[bare.joint("LeftFoot"), 1]
+    assert ankle == pytest.approx(0.075 + heel_m, abs=0.03)
+
+
+@pytest.mark.slow
+def test_a_jacket_is_padded_down_to_the_wrists_and_wide_trousers_widen_to_their_hem() -> None:
+    shirt, jacket, wide = (
+        make_person(0, 64, replace(choose_outfit(0), **cut))[0].body
+        for cut in ({}, {"jacket_m": 0.04}, {"trouser_flare_m": 0.05})
+    )
+    joints = {name: shirt.joints_m[shirt.joint(name)] for name in ("LeftForeArm", "LeftHand", "LeftFoot", "Hips")}
+    moved_m = np.linalg.norm(jacket.vertices - shirt.vertices, axis=1)
+    bone = joints["LeftHand"] - joints["LeftForeArm"]
+    along = (shirt.vertices - joints["LeftForeArm"]) @ bone / (bone**2).sum()
+    on_forearm = shirt.skin_weights[:, shirt.joint("LeftForeArm")] > 0.9
+    assert 0.03 < moved_m[on_forearm & (along > 0.3) & (along < 0.6)].mean() < 0.06  # with the shirt's own thickness
+    assert moved_m[shirt.vertices[:, 1] < joints["Hips"][1] - 0.15].max() < 0.002
+    moved_m = np.linalg.norm(wide.vertices - shirt.vertices, axis=1)
+    height = shirt.vertices[:, 1]
+    assert moved_m[(height > joints["LeftFoot"][1]) & (height < joints["LeftFoot"][1] + 0.03)].mean() > 0.035
+    assert moved_m[height > joints["Hips"][1]].max() < 0.002
