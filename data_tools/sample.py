@@ -54,6 +54,8 @@ def main(argv: Sequence[str]) -> None:
     validate_capture_options(options)
     if options.legwear != "skirt" and (options.flare_m is not None or options.hem_m is not None):
         raise UserError("--flare-m and --hem-m are of a skirt; add --legwear skirt")
+    if options.legwear != "trousers" and options.trouser_flare_m:
+        raise UserError(f"--trouser-flare-m is of trousers; remove it, or --legwear {options.legwear}")
     require_absent(options.out)
     finger_m = None if options.finger_mm is None else 1e-3 * options.finger_mm
     phenotypes = {name: vars(options)[name] for name in PHENOTYPES if vars(options)[name] is not None}

@@ -82,13 +82,14 @@ def write_true_input(capture: Path, folder: Path) -> None:
     """Make a copy of a capture whose video has the true camera and the true masks beside it.
 
     Raises:
-        UserError: the capture has no ground truth, or was filmed with a camera in the hand.
+        UserError: the capture has no ground truth, or was filmed with a camera in the hand or a lens with distortion.
     """
     truth = load_ground_truth(capture)
-    if truth.hand_held_deg:
+    if truth.hand_held_deg or truth.distortion:
         raise UserError(
-            f"{capture} has a hand-held camera (--hand-held-deg {truth.hand_held_deg:g}), its true masks are those of "
-            f"one that stands still; make a capture without this option: {format_module_command(SAMPLE, 'NEW_FOLDER')}"
+            f"{capture} has a hand-held camera or a lens with distortion (--hand-held-deg {truth.hand_held_deg:g}, "
+            f"--distortion {truth.distortion:g}), its true masks are of an ideal camera that stands still; make a "
+            f"capture without these options: {format_module_command(SAMPLE, 'NEW_FOLDER')}"
         )
     camera = truth.camera
     numbers = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}

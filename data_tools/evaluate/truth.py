@@ -67,7 +67,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         ground_m = np.array(settings["ground_m"], dtype=np.float64).reshape(3)
         light = Light(**{name: _tuple_of(value) for name, value in settings["light"].items()})
         fps, samples = float(settings["fps"]), int(settings["samples"])
-        hand_held_deg = float(settings["hand_held_deg"])
+        hand_held_deg, distortion = float(settings["hand_held_deg"]), float(settings["distortion"])
         is_furnished, seed = settings["background"] == "busy", int(settings["seed"])
     except (KeyError, TypeError, ValueError):
         raise _damaged_settings_error(out) from None
@@ -86,6 +86,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
         hand_held_deg=hand_held_deg,
         surroundings=surroundings,
+        distortion=distortion,
     )
 
 

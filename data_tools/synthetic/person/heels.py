@@ -7,17 +7,30 @@ import torch
 from jaxtyping import Float
 
 from pipeline.body.body import Body
+from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import linear_blend_skinning
 
+MAX_HEEL_OF_SOLE = 0.8
+"""Largest height of a heel over the length of the foot from the heel to the joint of the toes."""
+
 
 def with_raised_heels(body: Body, heel_m: float) -> Body:
-    """Return the body whose heels are this far above the floor; its lowest vertex stays at its height."""
+    """Return the body whose heels are this far above the floor; its lowest vertex stays at its height.
+
+    Raises:
+        UserError: the heels are too high for feet of this length.
+    """
     transforms = np.tile(np.eye(4), (len(body.joint_names), 1, 1))
     for side in ("Left", "Right"):
         ankle, ball = (body.joint(f"{side}{name}") for name in ("Foot", "ToeBase"))
         heel_z = body.vertices[body.skin_weights[:, ankle] > 0.5, 2].min()
-        angle = np.arcsin(heel_m / (body.joints_m[ball, 2] - heel_z))
+        sole_m = float(body.joints_m[ball, 2] - heel_z)
+        if heel_m > MAX_HEEL_OF_SOLE * sole_m:
+            raise UserError(
+                f"--heel-m {heel_m:g} is too high for this foot; choose up to {MAX_HEEL_OF_SOLE * sole_m:.2f}"
+            )
+        angle = np.arcsin(heel_m / sole_m)
         transforms[ankle] = _about(body.joints_m[ankle], angle)
         transforms[ball] = transforms[ankle] @ _about(body.joints_m[ball], -angle)
     posed = linear_blend_skinning(

@@ -17,7 +17,7 @@ def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Compariso
 
 @pytest.fixture(scope="session")
 def hand_held(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture `sample`, filmed with a camera in the hand."""
+    """The capture `sample`, filmed with a camera in the hand whose lens distorts."""
     out = tmp_path_factory.mktemp("captures") / "hand-held"
-    make_sample([str(out), *SAMPLE_OPTIONS, "--hand-held-deg", "3"])
+    make_sample([str(out), *SAMPLE_OPTIONS, "--hand-held-deg", "3", "--distortion", "-0.1"])
     return out

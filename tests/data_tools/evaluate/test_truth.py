@@ -51,7 +51,8 @@ def test_wrong_ground_truth_is_detected(sample: Path, tmp_path: Path, capsys: py
 
 
 def test_ground_truth_of_a_camera_in_the_hand_reproduces_its_video(hand_held: Path) -> None:
-    assert load_ground_truth(hand_held).hand_held_deg == 3.0
+    truth = load_ground_truth(hand_held)
+    assert (truth.hand_held_deg, truth.distortion) == (3.0, -0.1)
     assert verify_ground_truth(hand_held, frame_stride=2).passes()
 
 

@@ -148,6 +148,8 @@ def test_existing_folder_is_an_error(sample: Path, capsys: pytest.CaptureFixture
         ("--seed", "-1"),
         ("--turns", "0"),
         ("--flare-m", "0.7"),
+        ("--heel-m", "0.2"),
+        ("--distortion", "-0.6"),
     ],
 )
 def test_options_out_of_range_are_errors(
@@ -166,6 +168,8 @@ def test_options_out_of_range_are_errors(
         (["--turns", "2", "--arc", "90"], "remove it, or --bvh and --arc"),
         (["--turns", "2", "--bvh", "walk.bvh"], "remove it, or --bvh and --arc"),
         (["--flare-m", "0.2"], "add --legwear skirt"),
+        (["--trouser-flare-m", "0.05", "--legwear", "skirt"], "is of trousers"),
+        (["--age", "0.1", "--heel-m", "0.12"], "--heel-m 0.12 is too high"),
     ],
 )
 def test_options_that_would_have_no_effect_are_errors(
