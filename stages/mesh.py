@@ -388,7 +388,7 @@ def write_results(
 
 STAGE = Stage(
     "mesh",
-    version=56,
+    version=57,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

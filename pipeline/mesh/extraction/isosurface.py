@@ -159,6 +159,7 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value[hands] += samples.hand_weight[hands] * (hand - value[hands])
     np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples), out=value)
     np.maximum(value, _fill_voids(value >= SURFACE_ISOVALUE, samples), out=value)
+    np.maximum(value, fill_trousers(value >= SURFACE_ISOVALUE, samples), out=value)
     value *= 1.0 - samples.emptiness
     np.minimum(value, parted_legs(samples), out=value)
     value[excess_between_legs(value >= SURFACE_ISOVALUE, samples)] = 0.0
@@ -295,6 +296,23 @@ def _fill_voids(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Fl
     filled[upper] = (unreachable & (ndimage.distance_transform_edt(~is_void) <= 2.0 * radius))[middle]
     near = ndimage.binary_dilation(filled, iterations=2)
     return upsample(near * ndimage.gaussian_filter((solid | filled).astype(np.float64), 0.7), inside.shape)
+
+
+def fill_trousers(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Float[np.ndarray, "x y z"]:
+    """Return an indicator in [0, 1] of the voids of horizontal slices of legs below the crotch, and the hem of a skirt.
+
+    The density in wide trousers, around the leg, is arbitrary: it has voids that open below the hem in ragged holes.
+    """
+    top_m = grid.crotch_m if grid.hem_m is None else min(grid.crotch_m, grid.hem_m)
+    lower = np.s_[:, : grid.row(top_m)]
+    in_slice = np.zeros((3, 3, 3), dtype=bool)
+    in_slice[:, 1, 1] = in_slice[1, 1, :] = True
+    has_leg = (grid.body_distance_m[lower] < 0.0).any(axis=(0, 2), keepdims=True)
+    solid = inside[lower] | (ndimage.binary_fill_holes(inside[lower], in_slice) & has_leg)
+    near = ndimage.binary_dilation(solid & ~inside[lower], iterations=2)
+    filled = np.zeros(inside.shape, dtype=np.float32)
+    filled[lower] = near * ndimage.gaussian_filter(solid.astype(np.float32), 0.7)
+    return filled
 
 
 def upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:

@@ -14,12 +14,14 @@ from pipeline.geometry.surface import is_closed_manifold
 from pipeline.mesh.extraction.isosurface import (
     SURFACE_ISOVALUE,
     extract_mesh,
+    fill_trousers,
     hand_skin_weights,
     indicator_grid,
     sample_canonical_grid,
     select_isovalue,
 )
 from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
+from tests.mesh.extraction.two_legs import CROTCH_M, LEG_RADIUS_M, LEG_X_M, leg_grid
 
 WITHOUT_HANDS = replace(SETTINGS, hands_from_body=False)
 
@@ -97,6 +99,24 @@ def test_a_void_that_narrow_openings_lead_to_is_filled(body: Body) -> None:
             for point_m in np.array([[-0.15, 0.7, 0.0], [-0.15, 0.79, 0.0], [0.1, 0.5, 0.12]])
         )
         assert (void, top, gap) == (is_filled, is_filled, False)
+
+
+@pytest.mark.parametrize(
+    ("hem_m", "slit_m", "is_filled"),
+    [(None, 0.0, True), (0.1, 0.0, False), (None, 0.03, False)],
+    ids=["trousers", "skirt", "open at the side"],
+)
+def test_trousers_are_filled_in_each_slice(hem_m: float | None, slit_m: float, is_filled: bool) -> None:
+    """A tube of cloth 3 cm off each leg that is open at its hem, and at its outer side as wide as told."""
+    grid, (x, y, z) = leg_grid(hem_m=hem_m)
+    cloth_m = np.abs(np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M - 0.03) - 0.006
+    slit = (np.abs(x) > LEG_X_M) & (np.abs(z) < 0.5 * slit_m)
+    inside = (grid.body_distance_m < 0.0) | ((cloth_m < 0.0) & ~slit & (y > 0.15) & (y < CROTCH_M))
+    filled = fill_trousers(inside, grid) >= SURFACE_ISOVALUE
+    void = ~inside & (np.abs(np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M - 0.012) < 0.006)
+    assert filled[void & (y > 0.2) & (y < CROTCH_M - 0.02)].all() == is_filled
+    assert filled[void].any() == is_filled
+    assert not filled[y < 0.13].any()
 
 
 def test_hand_weights_sum_over_every_joint_of_a_hand(body: Body) -> None:
