@@ -93,12 +93,12 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
         depths = np.where(
             skin_vertices[:, None], compute_layer_depths_m(drape, arm_head_weights, anatomy, outfit), -1.0
         )
-        flare_m = {
+        additional_m = {
             "shirt": sleeve_flare_offset_m(drape, arm_head_weights, anatomy, outfit)
             + jacket_offset_m(drape, depths[:, LAYERS.index("shirt")], outfit),
             "trousers": trouser_flare_offset_m(drape, anatomy, outfit),
         }
-        vertices = _add_layers(base_surface, faces, mean, depths, flare_m, anatomy, noise)
+        vertices = _add_layers(base_surface, faces, mean, depths, additional_m, anatomy, noise)
     clothed_body = replace(
         body, vertices=vertices, faces=faces, skin_weights=append_midpoint_values(body.skin_weights, pairs)
     )
