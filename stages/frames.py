@@ -26,6 +26,7 @@ from pipeline.capture.input_checks import (
     lacks_head_or_feet,
     sample_scene_changes,
 )
+from pipeline.capture.masks.raggedness import assess_supplied_masks
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
 from pipeline.capture.worker_pool import start_worker_pool
@@ -103,6 +104,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     capture = make_capture(detections, selected, out, source, user_files)
     save_capture(capture)
     write_rgb(out / CONTACT_SHEET, contact_sheet(capture))
+    if user_files.read_mask is not None and not user_files.masks_are_own_alpha:
+        assess_supplied_masks(capture, source.path)
     unseen_arc_rad = selection.largest_yaw_gap_rad(selection.body_yaw_rad(capture.landmarks_world_m))
     return {
         **assess_input(detections, unseen_arc_rad, source.path),

@@ -13,7 +13,7 @@ from pipeline.capture.capture import load_capture
 from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from pipeline.io.image import write_gray, write_rgb
+from pipeline.io.image import read_gray, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from stages import frames
 from tests.capture.test_exif_focal import tiff, with_exif
@@ -61,6 +61,19 @@ def test_a_whole_recording(tmp_path):
     for name in frames.STAGE.makes:
         assert (tmp_path / "out" / name).exists()
     assert take_warnings() == []
+
+
+def test_supplied_masks_with_holes_and_specks_are_a_warning(tmp_path):
+    recording = draw_recording(tmp_path / "in")
+    rng = np.random.default_rng(1)
+    for path in (recording / "masks").iterdir():
+        mask = read_gray(path)
+        mask[rng.random(mask.shape) < 0.03] = 255
+        write_gray(path, mask)
+    run(recording, tmp_path / "out")
+    (warning,) = take_warnings()
+    assert "masks in masks/" in warning
+    assert "use a copy without masks/" in warning
 
 
 def test_duplicates_are_dropped_and_the_rest_is_thinned_out(tmp_path):
