@@ -346,7 +346,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=43,
+    version=44,
     needs=("frames",),
     makes=(_BODY, _BARE, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -11,13 +11,15 @@ from pipeline.body.fit import fit as fit_module
 from pipeline.body.fit.ground_contact import FLOOR_TILT_STD_RAD, floor_tilt_information, sole_points
 from pipeline.body.fit.initialisation import in_world_axes
 from pipeline.body.fit.landmark_regressor import landmark_regressor
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS
 from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.vertical.gravity import (
-    LEAN_BIAS_RAD,
     LEAN_GAIN_TOWARDS,
+    LEAN_OF_ELEVATION,
     MAX_TURN_RAD,
+    USUAL_ELEVATION_RAD,
     TiltEvidence,
     align_with_gravity,
     axis_evidence,
@@ -164,10 +166,20 @@ def test_the_world_is_turned_by_the_mean_lean_of_a_turn() -> None:
     """Hardly anything is known of the vertical but the bodies, and then the axis of the turn as well."""
     scene = standing(2 * np.pi)
 
-    looks_down = turn_camera(scene.camera, rotation_deg(10.0, 0.0, 0.0).T, STILL)
-    assert camera_tilt_deg(looks_down)[0] == pytest.approx(-10.0, abs=1e-4)
+    neck_m = pose_skeleton(scene.model, scene.state.rotations, scene.state.root_m).position_m[
+        0, ACTIVE_JOINTS.index("Neck")
+    ]
 
-    def turn(state: FitState, axis_std_rad: float = np.pi, camera: Camera = looks_down) -> torch.Tensor:
+    def camera_below_neck(elevation_deg: float) -> Camera:
+        """Return a camera 2 m in front of the neck from which it is seen under this elevation."""
+        world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+        centre_m = neck_m.numpy() + [0.0, -2.0 * np.tan(np.radians(elevation_deg)), 2.0]
+        world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ centre_m
+        return replace(scene.camera, world_to_camera=world_to_camera.astype(np.float32))
+
+    from_above = camera_below_neck(-5.0)
+
+    def turn(state: FitState, axis_std_rad: float = np.pi, camera: Camera = from_above) -> torch.Tensor:
         """Return where +Y of the old world points, to the right and towards the camera, degrees."""
         axis = TiltEvidence.from_std(STILL[:2], torch.full_like(STILL[:2], axis_std_rad))
         return torch.rad2deg(upright_turn(scene.model, state, axis, SETTINGS, camera)[[0, 2], 1])
@@ -181,10 +193,11 @@ def test_the_world_is_turned_by_the_mean_lean_of_a_turn() -> None:
     assert float(halved[1] / turn(slightly)[1]) == pytest.approx(0.5, abs=0.05)
     fallen = turn(turn_state(scene.state, rotation_deg(20.0, 0.0, 0.0), STILL))
     assert float(fallen[1]) == pytest.approx(-np.degrees(MAX_TURN_RAD), abs=0.1)
-    for pitch_deg, bias_deg in ((0.0, np.degrees(LEAN_BIAS_RAD)), (10.0, np.degrees(LEAN_BIAS_RAD) + 1.5)):
-        camera = turn_camera(scene.camera, rotation_deg(-pitch_deg, 0.0, 0.0).T, STILL)
-        towards_deg = turn(scene.state, camera=camera)[1] - trunk[1]
-        assert float(towards_deg) == pytest.approx(bias_deg, abs=0.05)
+    usual_deg = float(np.degrees(USUAL_ELEVATION_RAD))
+    for beyond_deg in (-2.0, 0.0, 10.0, 25.0):
+        towards_deg = turn(scene.state, camera=camera_below_neck(usual_deg + beyond_deg))[1] - trunk[1]
+        expected_deg = LEAN_GAIN_TOWARDS * LEAN_OF_ELEVATION * max(0.0, beyond_deg)
+        assert float(towards_deg) == pytest.approx(expected_deg, abs=0.05)
     assert turn(turn_state(standing(0.3).state, rotation_deg(5.0, 0.0, 0.0), STILL)).tolist() == [0.0, 0.0]
 
 
