@@ -65,6 +65,10 @@ class LegGrid:
         middle = round(-self.origin_m[0] / self.spacing_m)
         return middle if 0 < middle < self.body_distance_m.shape[0] else 0
 
+    def legs_top_m(self) -> float:
+        """Return the height below which the legs are apart: the crotch, or a lower hem."""
+        return self.crotch_m if self.hem_m is None else min(self.crotch_m, self.hem_m)
+
     def row(self, height_m: float) -> int:
         """Return the row at a height, within the grid."""
         row = round((height_m - self.origin_m[1]) / self.spacing_m)
@@ -97,7 +101,7 @@ def excess_between_legs(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Boo
     both legs stays.
     """
     excess, middle = np.zeros_like(inside), grid.middle()
-    top_m = grid.crotch_m if grid.hem_m is None else min(grid.crotch_m, grid.hem_m)
+    top_m = grid.legs_top_m()
     for row in range(grid.row(top_m) if middle else 0):
         distance_m = grid.body_distance_m[:, row]
         axes = _leg_axes(distance_m < 0.0, middle)

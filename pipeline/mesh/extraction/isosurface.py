@@ -303,8 +303,7 @@ def fill_trousers(inside: Bool[np.ndarray, "x y z"], grid: LegGrid) -> Float[np.
 
     The density in wide trousers, around the leg, is arbitrary: it has voids that open below the hem in ragged holes.
     """
-    top_m = grid.crotch_m if grid.hem_m is None else min(grid.crotch_m, grid.hem_m)
-    lower = np.s_[:, : grid.row(top_m)]
+    lower = np.s_[:, : grid.row(grid.legs_top_m())]
     in_slice = np.zeros((3, 3, 3), dtype=bool)
     in_slice[:, 1, 1] = in_slice[1, 1, :] = True
     has_leg = (grid.body_distance_m[lower] < 0.0).any(axis=(0, 2), keepdims=True)
